@@ -1,0 +1,8 @@
+//! Cameras: intrinsics, lens distortion, projection.
+//!
+//! Points are in the camera optical frame of REP 103 (x right, y down, z forward, metres);
+//! pixel (0, 0) is the centre of the top-left pixel.
+
+mod intrinsics;
+
+pub use intrinsics::Intrinsics;

@@ -1,0 +1,1 @@
+//! A frame in, an estimate out: the API that other programs embed.

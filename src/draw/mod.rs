@@ -1,0 +1,1 @@
+//! Pictures for people: masks, tinted overlays, joints drawn along the arm.

@@ -1,0 +1,13 @@
+//! Finds a robot arm in one colour image from a freely moving camera: which pixels are the robot,
+//! and where its joints are, in metres, in the camera's optical frame (REP 103).
+
+pub mod camera;
+pub mod cascade;
+#[cfg(feature = "cli")]
+pub mod cli;
+pub mod draw;
+pub mod gpu;
+pub mod network;
+#[cfg(feature = "recording")]
+pub mod recording;
+pub mod reference;

@@ -1,0 +1,5 @@
+//! The `whereabot` command.
+
+fn main() -> std::process::ExitCode {
+    whereabot::cli::main()
+}

@@ -1,0 +1,1 @@
+//! What a network is: layers, shapes, the model file. No GPU here.

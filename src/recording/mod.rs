@@ -1,0 +1,1 @@
+//! Data sets: robot kinematics, rendering new recordings, reading and writing them.
