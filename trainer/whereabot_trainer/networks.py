@@ -95,7 +95,9 @@ class Network(nn.Module):
             elif op == "max_pool2d":
                 value = nn.functional.max_pool2d(value, layer["size"])
             elif op == "dense":
-                value = getattr(self, name)(value.flatten(1))
+                # In bfloat16 the rounding of coordinates alone would cost millimetres.
+                with torch.autocast(value.device.type, enabled=False):
+                    value = getattr(self, name)(value.float().flatten(1))
             elif op == "sigmoid":
                 value = torch.sigmoid(value.float())
             activation = layer.get("activation", "none")
