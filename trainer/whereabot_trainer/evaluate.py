@@ -62,7 +62,7 @@ def figures_by_threshold(robot, background):
     hits, alarms = (part[:, ::-1].cumsum(1)[:, ::-1].astype(float) for part in (robot, background))
     positives = hits[:, :1]
     shown = positives[:, 0] > 0
-    iou = (hits / (positives + alarms))[shown].mean(0) if shown.any() else np.zeros(robot.shape[1])
+    iou = (hits[shown] / (positives + alarms)[shown]).mean(0) if shown.any() else np.zeros(robot.shape[1])
     total = robot.sum() + background.sum()
     return {
         "accuracy": (hits.sum(0) + background.sum() - alarms.sum(0)) / total, "iou": iou,

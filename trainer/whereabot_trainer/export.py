@@ -100,7 +100,8 @@ def export_runs(args):
         [coverage[n] for n in chosen if seen[n]], without + list(photos_without.values()))
 
     robots = reported[seen[reported]]
-    figures = evaluate.score_mask(mask, samples, reported, args.device)
+    measured = evaluate.score_mask(mask, samples, reported, args.device)
+    figures = {name: measured[name] for name in ("accuracy", "iou", "precision", "recall")}
     for name, masks in (("true_mask", None), ("estimated_mask", estimated)):
         figures |= evaluate.score_joints(joint, evaluate.identity_metres, samples, robots, masks, args.device, name)
     found = robots[[coverage[n] >= least for n in robots]]
