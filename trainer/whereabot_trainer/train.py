@@ -158,6 +158,16 @@ def load_samples(args):
     return samples, numbers, held_out, np.sort(validation), card
 
 
+def initialise(network):
+    """He initialisation: with PyTorch's own, a chain of ReLU layers without normalisation starts nearly silent."""
+    for layer in network.layers:
+        if layer.get("activation") == "relu":
+            module = getattr(network, layer["name"])
+            torch.nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+            torch.nn.init.zeros_(module.bias)
+    return network
+
+
 def load_network(run, name="best.pt"):
     """(network in eval mode, checkpoint) of a run; the network's input is told from its first layer."""
     state = torch.load(Path(run) / name, weights_only=False, map_location="cpu")
@@ -174,7 +184,8 @@ def train_mask(args):
     w_fg, w_bg = losses.class_weights(share)
     height, width = args.crop[1], args.crop[0]
     card |= {"foreground_share": share, "w_fg": w_fg, "w_bg": w_bg, "crop": args.crop, "zoom": args.zoom}
-    network = Network(paper_mask_layers(args.dilations), MASK_INPUT).to(args.device, memory_format=torch.channels_last)
+    network = initialise(Network(paper_mask_layers(args.dilations), MASK_INPUT))
+    network = network.to(args.device, memory_format=torch.channels_last)
 
     def batch_loss(batch, _progress):
         images, masks = (tensor.to(args.device) for tensor in samples.pixels(batch))
@@ -225,7 +236,7 @@ def train_joint(args):
     card |= {"samples": len(numbers), "min_coverage": args.min_coverage, "estimated_masks": args.estimated_masks,
              "estimated_after": args.estimated_after,
              "mean": standard.mean.tolist(), "deviation": standard.deviation.tolist()}
-    network = Network(paper_joint_layers(args.dilations, args.pool), JOINT_INPUT)
+    network = initialise(Network(paper_joint_layers(args.dilations, args.pool), JOINT_INPUT))
     network = network.to(args.device, memory_format=torch.channels_last)
     joints = torch.from_numpy(samples.joints)
 
