@@ -122,6 +122,22 @@ def test_committed_golden_files_are_what_pytorch_computes(tmp_path, request):
     assert (values["joints"] - load_file(committed / "tiny.activations.safetensors")["joints"]).abs().max() > 1e-5
 
 
+def test_folding_normalisation_keeps_the_function():
+    torch.manual_seed(0)
+    network = Network(paper_joint_layers(pool=4), JOINT_INPUT, normalise=True)
+    plain = Network(paper_joint_layers(pool=4), JOINT_INPUT)
+    for _ in range(3):
+        network(torch.rand(4, 3, 212, 256))
+    network.eval()
+    images = torch.rand(2, 3, 212, 256)
+    before = network(images)
+    network.conv1_norm.weight.data *= 1.01
+    changed = network(images)
+    network.fold_normalisation()
+    assert torch.allclose(network(images), changed, atol=1e-5) and not torch.allclose(before, changed, atol=1e-5)
+    assert network.state_dict().keys() == plain.state_dict().keys()
+
+
 def test_a_network_refuses_what_it_cannot_build():
     layers = paper_joint_layers()
     layers[1]["inputs"] = ["nowhere"]

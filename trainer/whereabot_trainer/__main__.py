@@ -29,6 +29,8 @@ def _training_flags(parser, *, minutes, batch, learning_rate, momentum, dilation
                         help="momentum of SGD or beta1 of AdamW, growing linearly (%(default)s)")
     parser.add_argument("--weight-decay", type=float, default=1e-4, metavar="W", help="(%(default)s)")
     parser.add_argument("--clip-gradient", type=float, default=5.0, metavar="NORM", help="(%(default)s)")
+    parser.add_argument("--normalise", action=argparse.BooleanOptionalAction, default=True,
+                        help="batch normalisation while training, folded into the convolutions at export (%(default)s)")
     parser.add_argument("--evaluate-every", type=int, default=500, metavar="N",
                         help="validate and save every N batches (%(default)s)")
     parser.add_argument("--precision", choices=("bf16", "f32"), default="bf16", help="of the training pass (%(default)s)")

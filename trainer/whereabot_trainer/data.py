@@ -188,12 +188,12 @@ def jitter_colours(images):
 
 def _jitter_colours(images):
     count = len(images)
-    images = images * (_uniform(count, 0.6, 1.4, 1, 1, 1) * _uniform(count, 0.88, 1.12, 3, 1, 1))
+    images = images * (_uniform(count, 0.75, 1.25, 1, 1, 1) * _uniform(count, 0.93, 1.07, 3, 1, 1))
     grey = images.mean(1, keepdim=True)
-    images = torch.lerp(grey, images, _uniform(count, 0.4, 1.5, 1, 1, 1))
+    images = torch.lerp(grey, images, _uniform(count, 0.6, 1.4, 1, 1, 1))
     level = grey.mean((2, 3), keepdim=True)
-    images = torch.lerp(level, images, _uniform(count, 0.7, 1.3, 1, 1, 1)).clamp_(1e-3, 1)
-    images = images.pow_(torch.exp(_uniform(count, -0.4, 0.4, 1, 1, 1)))
+    images = torch.lerp(level, images, _uniform(count, 0.8, 1.2, 1, 1, 1)).clamp_(1e-3, 1)
+    images = images.pow_(torch.exp(_uniform(count, -0.25, 0.25, 1, 1, 1)))
     if torch.rand(()) < 0.25:
         soft = torch.nn.functional.avg_pool2d(images, 3, 1, 1, count_include_pad=False)
         # Between sharpened (-0.5) and blurred (1).

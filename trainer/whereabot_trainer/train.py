@@ -88,7 +88,7 @@ def fit(args, network, numbers, batch_loss, score, better, card):
 
     def save(path, **more):
         partial = path.with_suffix(".partial")
-        torch.save({"layers": network.layers, "network": network.state_dict(), "card": card,
+        torch.save({"layers": network.layers, "normalise": network.normalise, "network": network.state_dict(), "card": card,
                     "iteration": iteration, "seconds": seconds, **more}, partial)
         partial.replace(path)
 
@@ -153,7 +153,7 @@ def load_samples(args):
         "training_recordings": samples.sources, "validation_recordings": held_out.sources if args.validation else [],
         "protocol": protocol, "seed": args.seed, "precision": args.precision, "optimizer": args.optimizer,
         "learning_rate": args.learning_rate, "momentum": args.momentum, "batch": args.batch,
-        "minutes": args.minutes, "iterations": args.iterations,
+        "minutes": args.minutes, "iterations": args.iterations, "normalise": args.normalise,
     }
     return samples, numbers, held_out, np.sort(validation), card
 
@@ -169,11 +169,11 @@ def initialise(network):
 
 
 def load_network(run, name="best.pt"):
-    """(network in eval mode, checkpoint) of a run; the network's input is told from its first layer."""
+    """(network in eval mode, without normalisation, checkpoint) of a run; its first layer tells the input's name."""
     state = torch.load(Path(run) / name, weights_only=False, map_location="cpu")
-    network = Network(state["layers"], state["layers"][0]["inputs"][0])
+    network = Network(state["layers"], state["layers"][0]["inputs"][0], normalise=state["normalise"])
     network.load_state_dict(state["network"])
-    return network.eval(), state
+    return network.eval().fold_normalisation(), state
 
 
 # --- the mask network ------------------------------------------------------------------------------------------------
@@ -184,7 +184,7 @@ def train_mask(args):
     w_fg, w_bg = losses.class_weights(share)
     height, width = args.crop[1], args.crop[0]
     card |= {"foreground_share": share, "w_fg": w_fg, "w_bg": w_bg, "crop": args.crop, "zoom": args.zoom}
-    network = initialise(Network(paper_mask_layers(args.dilations), MASK_INPUT))
+    network = initialise(Network(paper_mask_layers(args.dilations), MASK_INPUT, normalise=args.normalise))
     network = network.to(args.device, memory_format=torch.channels_last)
 
     def batch_loss(batch, _progress):
@@ -236,7 +236,7 @@ def train_joint(args):
     card |= {"samples": len(numbers), "min_coverage": args.min_coverage, "estimated_masks": args.estimated_masks,
              "estimated_after": args.estimated_after,
              "mean": standard.mean.tolist(), "deviation": standard.deviation.tolist()}
-    network = initialise(Network(paper_joint_layers(args.dilations, args.pool), JOINT_INPUT))
+    network = initialise(Network(paper_joint_layers(args.dilations, args.pool), JOINT_INPUT, normalise=args.normalise))
     network = network.to(args.device, memory_format=torch.channels_last)
     joints = torch.from_numpy(samples.joints)
 
