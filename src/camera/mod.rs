@@ -4,5 +4,7 @@
 //! pixel (0, 0) is the centre of the top-left pixel.
 
 mod intrinsics;
+mod lens;
 
 pub use intrinsics::Intrinsics;
+pub use lens::{Camera, Distortion};
