@@ -52,3 +52,30 @@ impl Camera {
         }
     }
 }
+
+impl Camera {
+    /// Infinite for now.
+    pub fn max_radius(&self) -> f64 {
+        f64::INFINITY
+    }
+
+    /// Pinhole for now.
+    pub fn pixel_of_ray(&self, ray: [f64; 2]) -> [f64; 2] {
+        [
+            ray[0] * self.intrinsics.fx + self.intrinsics.cx,
+            ray[1] * self.intrinsics.fy + self.intrinsics.cy,
+        ]
+    }
+}
+
+impl Camera {
+    /// Stub.
+    pub fn project(&self, p: [f64; 3]) -> Option<[f64; 2]> {
+        self.intrinsics.project(p)
+    }
+
+    /// Stub.
+    pub fn field_of(&self, _canonical: &Intrinsics, _width: u32, _height: u32) -> f64 {
+        1.0
+    }
+}

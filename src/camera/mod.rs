@@ -5,6 +5,8 @@
 
 mod intrinsics;
 mod lens;
+mod rectification;
 
 pub use intrinsics::Intrinsics;
 pub use lens::{Camera, Distortion};
+pub use rectification::Rectification;
