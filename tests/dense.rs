@@ -15,7 +15,7 @@ fn dense(out_features: usize, activation: Activation) -> Operation {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 32, ..ProptestConfig::default() })]
+    #![proptest_config(common::cases(32))]
 
     #[test]
     fn the_kernel_agrees_with_the_reference(

@@ -8,7 +8,7 @@ use proptest::prelude::*;
 use whereabot::network::{Operation, Shape};
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 32, ..ProptestConfig::default() })]
+    #![proptest_config(common::cases(32))]
 
     #[test]
     fn the_kernel_agrees_with_the_reference(

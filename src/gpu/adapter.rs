@@ -129,7 +129,7 @@ pub struct Choice {
 pub fn list_adapters(
     request: &AdapterRequest,
 ) -> Result<(Vec<AdapterReport>, Result<Choice, GpuError>), GpuError> {
-    let (_, adapters) = enumerate(request)?;
+    let (_, adapters) = enumerate(request.backends()?);
     let reports: Vec<_> = adapters.iter().map(AdapterReport::of).collect();
     let choice = choose(&reports, request);
     Ok((reports, choice))
@@ -139,20 +139,34 @@ pub fn list_adapters(
 pub(super) fn open(
     request: &AdapterRequest,
 ) -> Result<(wgpu::Instance, wgpu::Adapter, Choice), GpuError> {
-    let (instance, mut adapters) = enumerate(request)?;
+    let backends = request.backends()?;
+    // Without a wish, GL is looked at only where there is nothing better: opening it is slow, and
+    // noisy on a machine without a display.
+    if *request == AdapterRequest::default()
+        && let Ok(found) = open_among(Backends::PRIMARY, request)
+    {
+        return Ok(found);
+    }
+    open_among(backends, request)
+}
+
+fn open_among(
+    backends: Backends,
+    request: &AdapterRequest,
+) -> Result<(wgpu::Instance, wgpu::Adapter, Choice), GpuError> {
+    let (instance, mut adapters) = enumerate(backends);
     let reports: Vec<_> = adapters.iter().map(AdapterReport::of).collect();
     let choice = choose(&reports, request)?;
     Ok((instance, adapters.swap_remove(choice.index), choice))
 }
 
-fn enumerate(request: &AdapterRequest) -> Result<(wgpu::Instance, Vec<wgpu::Adapter>), GpuError> {
-    let backends = request.backends()?;
+fn enumerate(backends: Backends) -> (wgpu::Instance, Vec<wgpu::Adapter>) {
     let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
         backends,
         ..wgpu::InstanceDescriptor::new_without_display_handle()
     });
     let adapters = pollster::block_on(instance.enumerate_adapters(backends));
-    Ok((instance, adapters))
+    (instance, adapters)
 }
 
 fn choose(reports: &[AdapterReport], request: &AdapterRequest) -> Result<Choice, GpuError> {

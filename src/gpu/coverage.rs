@@ -36,7 +36,10 @@ impl Totals {
 }
 
 /// Counts and bounds the pixels of each `mask` `[1, height, width]` that reach `threshold`, into
-/// `totals`: one [`Totals`] an image.
+/// `totals`: one [`Totals`] an image, cleared before each run.
+///
+/// # Errors
+/// More pixels than a dispatch holds. Driver errors reach the caller's [`Device::scoped`].
 pub fn coverage(
     device: &Device,
     mask: &Tensor,

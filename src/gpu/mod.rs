@@ -16,8 +16,12 @@ mod step;
 mod tensor;
 
 pub use adapter::{AdapterReport, AdapterRequest, Choice, Wanted, list_adapters};
+pub use coverage::{Totals, coverage};
 pub use device::{Device, Tier};
 pub use error::GpuError;
 pub use network::NetworkPlan;
+pub use overlay::overlay;
 pub use plan::{Frame, Plan};
+pub use rectify::Rectify;
+pub use step::Step;
 pub use tensor::Tensor;

@@ -5,6 +5,9 @@ use crate::network::Overlay;
 
 /// The joint network's input (`shaders/overlay.wgsl`): `image` `[3, height, width]` masked by `mask`
 /// `[1, height, width]`.
+///
+/// # Errors
+/// More pixels than a dispatch holds. Driver errors reach the caller's [`Device::scoped`].
 pub fn overlay(
     device: &Device,
     image: &Tensor,

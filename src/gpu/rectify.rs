@@ -16,6 +16,9 @@ pub struct Rectify {
 
 impl Rectify {
     /// Into `output` `[3, height, width]`.
+    ///
+    /// # Errors
+    /// More pixels than a dispatch holds. Driver errors reach the caller's [`Device::scoped`].
     pub fn new(device: &Device, output: &Tensor) -> Result<Self, GpuError> {
         let (height, width) = (output.shape.height, output.shape.width);
         let texture = texture(device, 1, 1)?;
@@ -45,6 +48,9 @@ impl Rectify {
     }
 
     /// Writes `image` and `params` at the queue's next submission. `output` is that of [`Self::new`].
+    ///
+    /// # Errors
+    /// An image beyond the adapter's limits, or too little memory.
     pub fn write(
         &mut self,
         device: &Device,

@@ -75,7 +75,7 @@ impl Step {
     }
 
     /// Records the dispatch.
-    pub(super) fn encode(&self, pass: &mut wgpu::ComputePass<'_>) {
+    pub fn encode(&self, pass: &mut wgpu::ComputePass<'_>) {
         pass.set_pipeline(&self.pipeline);
         pass.set_bind_group(0, &self.bind_group, &[]);
         let [x, y] = self.workgroups;

@@ -13,6 +13,15 @@ use whereabot::gpu::{AdapterRequest, Device, NetworkPlan, Tensor};
 use whereabot::network::{Layer, Network, Operation, Parameters, Shape};
 use whereabot::reference;
 
+/// How often a property is tried. Failures print their case; they are kept as tests by hand.
+pub fn cases(count: u32) -> proptest::test_runner::Config {
+    proptest::test_runner::Config {
+        cases: count,
+        failure_persistence: None,
+        ..Default::default()
+    }
+}
+
 /// The adapter that the environment asks for, or the best: Mesa's lavapipe on a machine without a
 /// GPU. A machine without any adapter fails the test: the kernels were not tested.
 pub fn device() -> Arc<Device> {
@@ -117,6 +126,94 @@ pub fn check_layer(operation: Operation, input: Shape, batch: usize, seed: u64, 
         found <= tolerance,
         "{operation:?} {input} x {batch}: differs by {found}, allowed {tolerance}"
     );
+}
+
+/// Runs one step on its own.
+pub fn run_step(device: &Device, step: &whereabot::gpu::Step) {
+    let mut encoder = device.wgpu().create_command_encoder(&Default::default());
+    step.encode(&mut encoder.begin_compute_pass(&Default::default()));
+    device.queue().submit([encoder.finish()]);
+    device.wait().unwrap();
+}
+
+/// The description of a model of the paper's shape with few filters, for images of `width` x `height`.
+pub fn description(width: u32, height: u32, filters: usize) -> serde_json::Value {
+    let conv = |name: &str, input: &str, out: usize, dilation: usize, activation: &str| {
+        serde_json::json!({"name": name, "op": "conv2d", "inputs": [input], "out_channels": out,
+            "kernel": 3, "dilation": dilation, "activation": activation})
+    };
+    let pool = |name: &str, input: &str| serde_json::json!({"name": name, "op": "max_pool2d", "inputs": [input], "size": 2});
+    let focal = f64::from(width) * 182.5 / 256.0;
+    serde_json::json!({
+        "version": 1, "family": "paper", "robot": "ur5",
+        "joints": ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"],
+        "input": {"width": width, "height": height},
+        "camera": {"fx": focal, "fy": focal,
+            "cx": 0.5 * f64::from(width - 1), "cy": 0.5 * f64::from(height - 1)},
+        "mask_network": {"layers": [
+            conv("conv1", "image", filters, 1, "relu"), conv("conv2", "conv1", filters, 2, "relu"),
+            conv("conv3", "conv2", filters, 4, "relu"), conv("conv4", "conv3", filters, 8, "relu"),
+            conv("conv5", "conv4", 1, 1, "sigmoid")]},
+        "overlay": {"rule": "multiply"},
+        "joint_network": {"layers": [
+            conv("conv1", "overlay", filters, 1, "relu"), pool("pool1", "conv1"),
+            conv("conv2", "pool1", 2 * filters, 1, "relu"), pool("pool2", "conv2"),
+            conv("conv3", "pool2", 4 * filters, 1, "relu"),
+            {"name": "dense", "op": "dense", "inputs": ["conv3"], "out_features": 18, "activation": "none"}]},
+        "presence": {"mask_threshold": 0.5, "min_coverage": 0.01}
+    })
+}
+
+/// Dimensions of each tensor that the networks of `description` need.
+pub fn tensor_dims(description: &serde_json::Value) -> Vec<(String, Vec<usize>)> {
+    let side = |name: &str| description["input"][name].as_u64().unwrap() as usize;
+    let image = Shape::new(3, side("height"), side("width"));
+    let mut dims = Vec::new();
+    for (network, input) in [("mask", "image"), ("joint", "overlay")] {
+        let layers = description[format!("{network}_network")]["layers"].clone();
+        let layers: Vec<Layer> = serde_json::from_value(layers).unwrap();
+        Network::new(input, image, layers, |layer, weight, bias| {
+            dims.push((format!("{network}.{layer}.weight"), weight.to_vec()));
+            dims.push((format!("{network}.{layer}.bias"), bias.to_vec()));
+            Ok(Parameters {
+                weight: vec![],
+                bias: vec![],
+            })
+        })
+        .unwrap();
+    }
+    dims
+}
+
+/// The bytes of a model file with random weights for `description`. The joints' biases put the robot
+/// in front of the camera.
+pub fn model_file(description: &serde_json::Value, seed: u64) -> Vec<u8> {
+    let tensors: Vec<(String, Vec<usize>, Vec<f32>)> = tensor_dims(description)
+        .into_iter()
+        .enumerate()
+        .map(|(index, (name, dims))| {
+            let len: usize = dims.iter().product();
+            let mut values = noise(len, seed + index as u64);
+            if dims.len() > 1 {
+                let scale = (3.0 * dims[0] as f32 / len as f32).sqrt();
+                values.iter_mut().for_each(|v| *v *= scale);
+            }
+            if name == "joint.dense.bias" {
+                values.iter_mut().skip(2).step_by(3).for_each(|z| *z = 3.0);
+            }
+            (name, dims, values)
+        })
+        .collect();
+    let views = tensors.iter().map(|(name, dims, values)| {
+        let view = safetensors::tensor::TensorView::new(
+            safetensors::Dtype::F32,
+            dims.clone(),
+            bytemuck::cast_slice(values),
+        );
+        (name.as_str(), view.unwrap())
+    });
+    let metadata = [("whereabot".to_owned(), description.to_string())].into();
+    safetensors::serialize(views, Some(metadata)).unwrap()
 }
 
 /// The largest difference that rounding explains in a sum of `terms` values near 1.
