@@ -381,7 +381,7 @@ fn what_is_no_camera_is_refused_with_a_reason() {
         ),
         (
             "width: 9\nheight: 9\nk: [5, 0, .nan, 0, 5, 2, 0, 0, 1]\n",
-            "cx",
+            ".nan",
         ),
         (
             "width: 9\nheight: 9\nk: [5, 7, 3, 0, 5, 2, 0, 0, 1]\n",
