@@ -7,7 +7,9 @@ mod calibration;
 mod camera_info;
 mod intrinsics;
 mod lens;
+mod rectification;
 
 pub use calibration::{Camera, CameraError};
 pub use intrinsics::Intrinsics;
 pub use lens::{Distortion, Lens};
+pub use rectification::Rectification;

@@ -1,3 +1,4 @@
+use std::sync::Arc;
 use std::time::Duration;
 
 use crate::network::NetworkError;
@@ -55,7 +56,7 @@ pub enum GpuError {
     },
     /// A network that cannot be planned.
     #[error("{0}")]
-    Network(#[from] std::sync::Arc<NetworkError>),
+    Network(Arc<NetworkError>),
     /// The data does not have the size that the plan was made for.
     #[error("{what}: expected {expected} values, found {found}")]
     Size {
@@ -78,6 +79,12 @@ pub enum GpuError {
     /// The device did not answer.
     #[error("the GPU did not finish within {0:?}")]
     Timeout(Duration),
+}
+
+impl From<NetworkError> for GpuError {
+    fn from(error: NetworkError) -> Self {
+        Self::Network(Arc::new(error))
+    }
 }
 
 fn list(names: &[String]) -> String {

@@ -1,11 +1,13 @@
 //! What a network is: layers, shapes, the model file. No GPU here.
 
+mod coverage;
 mod description;
 mod graph;
 mod layer;
 mod model;
 mod shape;
 
+pub use coverage::Coverage;
 pub use description::{Description, InputSize, NetworkDescription, Overlay, Presence};
 pub use graph::{Network, Node, Parameters, Source};
 pub use layer::{Activation, Layer, Operation};
