@@ -9,7 +9,8 @@ use naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
 use naga::{Module, ShaderStage};
 
 /// One for each file in `shaders/`: a kernel that nobody lists is not tested.
-const KERNELS: [&str; 7] = [
+const KERNELS: [&str; 9] = [
+    "concat",
     "conv2d",
     "coverage",
     "dense",
@@ -17,6 +18,7 @@ const KERNELS: [&str; 7] = [
     "overlay",
     "rectify",
     "sigmoid",
+    "upsample2d",
 ];
 
 fn source(name: &str) -> String {
