@@ -110,12 +110,7 @@ fn object_fragment(in: Lit) -> Pixel {
     let s = view.shadow_from_camera * vec4(in.position + 0.012 * normal, 1.0);
     var lit = 1.0;
     if all(s.xy > vec2(0.0)) && all(s.xy < vec2(1.0)) && s.z < 1.0 {
-        let texel = 1.0 / vec2<f32>(textureDimensions(shadow_map));
-        lit = 0.0;
-        for (var i = 0; i < 4; i++) {
-            let shift = (vec2(f32(i & 1), f32(i >> 1)) - 0.5) * 1.5 * texel;
-            lit += 0.25 * textureSampleCompareLevel(shadow_map, shadow_sampler, s.xy + shift, s.z);
-        }
+        lit = textureSampleCompareLevel(shadow_map, shadow_sampler, s.xy, s.z);
     }
     lit = mix(1.0, lit, view.light_direction[0].w);
 

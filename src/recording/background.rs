@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 
 use image::RgbImage;
-use image::imageops::FilterType;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -32,7 +31,7 @@ impl PhotoView {
             zoom: rng.random_range(0.45..1.0),
             place: [rng.random_range(0.0..1.0), rng.random_range(0.0..1.0)],
             mirrored: rng.random_bool(0.5),
-            brightness: rng.random_range(0.6..1.2),
+            brightness: rng.random_range(0.7..1.25),
             blur: if blurred { rng.random_range(0.7..4.0) } else { 0.0 },
         }
     }
@@ -92,32 +91,75 @@ impl Backgrounds {
         let Some(path) = path else {
             return Err(RecordingError::NoBackgrounds { path: PathBuf::new() });
         };
-        let photo = decode(path)?;
-        let (width, height) = (f64::from(photo.width()), f64::from(photo.height()));
+        let mut photo = decode(path)?;
         let aspect = f64::from(WIDTH) / f64::from(HEIGHT);
-        let cut_width = view.zoom * width.min(height * aspect);
-        let cut_height = cut_width / aspect;
-        let x = (width - cut_width) * view.place[0];
-        let y = (height - cut_height) * view.place[1];
-        let cut = image::imageops::crop_imm(
-            &photo,
-            x as u32,
-            y as u32,
-            (cut_width as u32).max(1),
-            (cut_height as u32).max(1),
-        );
-        let mut cut = image::imageops::resize(&cut.to_image(), WIDTH, HEIGHT, FilterType::Triangle);
+        let cut_width = |photo: &RgbImage| {
+            view.zoom * f64::from(photo.width()).min(f64::from(photo.height()) * aspect)
+        };
+        let shrink = f64::from(WIDTH) / cut_width(&photo);
+        if shrink < 0.75 {
+            let (width, height) = (f64::from(photo.width()), f64::from(photo.height()));
+            let [width, height] = [width, height].map(|edge| (edge * shrink).ceil() as u32);
+            photo = image::imageops::thumbnail(&photo, width, height);
+        }
+        let step = cut_width(&photo) / f64::from(WIDTH);
+        let mut cut = resample(&photo, step, view.place, view.mirrored);
         if view.blur > 0.0 {
             cut = image::imageops::fast_blur(&cut, view.blur);
-        }
-        if view.mirrored {
-            image::imageops::flip_horizontal_in_place(&mut cut);
         }
         let brighter: Vec<u8> =
             (0..=255u8).map(|c| (f64::from(c) * view.brightness).min(255.0) as u8).collect();
         let bright = |c: u8| brighter.get(usize::from(c)).copied().unwrap_or(c);
-        Ok(cut.pixels().flat_map(|p| [bright(p.0[0]), bright(p.0[1]), bright(p.0[2]), 255]).collect())
+        let mut rgba = Vec::with_capacity((4 * WIDTH * HEIGHT) as usize);
+        for &[r, g, b] in cut.as_raw().as_chunks::<3>().0 {
+            rgba.extend_from_slice(&[bright(r), bright(g), bright(b), 255]);
+        }
+        Ok(rgba)
     }
+}
+
+/// Cuts `WIDTH` x `HEIGHT` pixels, `step` photo pixels apart, out of a photo, with linear interpolation.
+/// `place`: where in the photo the part lies, 0 (left, top) to 1.
+fn resample(photo: &RgbImage, step: f64, place: [f64; 2], mirrored: bool) -> RgbImage {
+    // Photo pixels before and after each output pixel, and the weight of the latter out of 256.
+    let taps = |count: u32, extent: u32, place: f64| -> Vec<(usize, usize, u32)> {
+        let start = (f64::from(extent) - step * f64::from(count)) * place;
+        let last = f64::from(extent.saturating_sub(1));
+        (0..count)
+            .map(|i| {
+                let at = (start + step * (f64::from(i) + 0.5) - 0.5).clamp(0.0, last);
+                let before = at.floor();
+                (before as usize, (before + 1.0).min(last) as usize, (256.0 * (at - before)) as u32)
+            })
+            .collect()
+    };
+    let mut columns = taps(WIDTH, photo.width(), place[0]);
+    if mirrored {
+        columns.reverse();
+    }
+    let stride = photo.width() as usize;
+    let pixels = photo.as_raw().as_chunks::<3>().0;
+    let row = |y: usize| pixels.get(y * stride..(y + 1) * stride).unwrap_or_default();
+    let mut out = RgbImage::new(WIDTH, HEIGHT);
+    let out_rows = out.as_chunks_mut::<3>().0.chunks_exact_mut(WIDTH as usize);
+    for (out_row, (above, below, down)) in out_rows.zip(taps(HEIGHT, photo.height(), place[1])) {
+        let (above, below) = (row(above), row(below));
+        for (slot, &(left, right, across)) in out_row.iter_mut().zip(&columns) {
+            let at = |row: &[[u8; 3]], x: usize| row.get(x).copied().unwrap_or_default().map(u32::from);
+            let corners = [at(above, left), at(above, right), at(below, left), at(below, right)];
+            let weights = [
+                (256 - across) * (256 - down),
+                across * (256 - down),
+                (256 - across) * down,
+                across * down,
+            ];
+            for (channel, value) in slot.iter_mut().enumerate() {
+                let sum: u32 = corners.iter().zip(weights).map(|(c, w)| c[channel] * w).sum();
+                *value = ((sum + (1 << 15)) >> 16) as u8;
+            }
+        }
+    }
+    out
 }
 
 fn decode(path: &Path) -> Result<RgbImage, RecordingError> {

@@ -106,11 +106,11 @@ pub fn record(
             None => stage.free_scene(request.seed, id, backgrounds.count())?,
         };
         let background = backgrounds.view(&scene.background)?;
-        let texture = backgrounds.view(&scene.texture)?;
+        let texture = scene.texture.as_ref().map(|view| backgrounds.view(view)).transpose()?;
         let mut picture = renderer
             .lock()
             .unwrap_or_else(std::sync::PoisonError::into_inner)
-            .draw(&scene, &background, &texture)?;
+            .draw(&scene, &background, texture.as_deref())?;
         scene.effects.apply(&mut picture.rgb);
         let sample = describe(id, &scene, &picture);
         write_picture(&folder, &sample, &picture)?;

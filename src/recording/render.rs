@@ -302,13 +302,14 @@ impl Renderer {
         &mut self,
         scene: &Scene,
         background: &[u8],
-        texture: &[u8],
+        texture: Option<&[u8]>,
     ) -> Result<Picture, RecordingError> {
         let fail = |message: String| RecordingError::Render(message);
         if scene.items.len() > ITEMS {
             return Err(fail(format!("expected at most {ITEMS} items, found {}", scene.items.len())));
         }
-        for (layer, photo) in [background, texture].into_iter().enumerate() {
+        for (layer, photo) in [Some(background), texture].into_iter().enumerate() {
+            let Some(photo) = photo else { continue };
             self.queue.write_texture(
                 wgpu::TexelCopyTextureInfo {
                     texture: &self.photos,
@@ -361,12 +362,15 @@ impl Renderer {
                 ..Default::default()
             });
             pass.set_bind_group(0, &self.scene_group, &[]);
-            pass.set_pipeline(&self.background_pipeline);
-            pass.draw(0..3, 0..1);
+            // Mostly front to back, so that hidden pixels cost little.
             pass.set_pipeline(&self.object_pipeline);
-            self.draw_items(&mut pass, scene, |kind| matches!(kind, Kind::Robot | Kind::Scenery));
+            for drawn in [Kind::Robot, Kind::Scenery, Kind::Surface] {
+                self.draw_items(&mut pass, scene, |kind| kind == drawn);
+            }
             pass.set_pipeline(&self.overlay_pipeline);
             self.draw_items(&mut pass, scene, |kind| kind == Kind::Cable);
+            pass.set_pipeline(&self.background_pipeline);
+            pass.draw(0..3, 0..1);
         }
         let pixels = u64::from(WIDTH * HEIGHT);
         for (target, offset, bytes) in [(&self.colour, 0, 4), (&self.robot, 4 * pixels, 1)] {
@@ -481,7 +485,7 @@ impl Pipelines<'_> {
         is_object: bool,
         mask_writes: wgpu::ColorWrites,
     ) -> wgpu::RenderPipeline {
-        let compare = if is_object { wgpu::CompareFunction::Less } else { wgpu::CompareFunction::Always };
+        let compare = if is_object { wgpu::CompareFunction::Less } else { wgpu::CompareFunction::LessEqual };
         let target = |format, write_mask| Some(wgpu::ColorTargetState { format, blend: None, write_mask });
         let targets = [target(COLOUR, wgpu::ColorWrites::ALL), target(ROBOT, mask_writes)];
         let fragment_entry = format!("{entry}_fragment");

@@ -115,8 +115,8 @@ pub struct Scene {
     pub centre: DVec3,
     /// The photo behind everything.
     pub background: PhotoView,
-    /// The photo on textured surfaces.
-    pub texture: PhotoView,
+    /// The photo on textured surfaces, where there are any.
+    pub texture: Option<PhotoView>,
     /// What the camera does to the picture.
     pub effects: Effects,
     /// The robot; `None` for a picture without one.
@@ -486,13 +486,15 @@ impl Stage {
                 .map(|j| camera_from_base.transform_point3(j))
                 .collect(),
         });
+        let texture = PhotoView::any(rng, photos, false);
+        let textured = build.items.iter().any(|item| item.material.photo > 0.0);
         Scene {
             camera_from_base,
             items: build.items,
             lighting: lighting(rng),
             centre,
             background: PhotoView::any(rng, photos, true),
-            texture: PhotoView::any(rng, photos, false),
+            texture: textured.then_some(texture),
             effects: Effects::any(rng),
             robot: posed,
         }
@@ -652,6 +654,21 @@ fn any_material(rng: &mut ChaCha8Rng) -> Material {
     }
 }
 
+/// The material of furniture, floors and walls: mostly neutral or wooden.
+fn furniture(rng: &mut ChaCha8Rng) -> Material {
+    let mut material = any_material(rng);
+    material.albedo = match rng.random_range(0.0..1.0) {
+        p if p < 0.4 => grey(rng, 0.35, 0.97),
+        p if p < 0.5 => grey(rng, 0.05, 0.35),
+        p if p < 0.7 => {
+            let (hue, saturation) = (rng.random_range(0.06..0.12), rng.random_range(0.15..0.55));
+            hsv(hue, saturation, rng.random_range(0.4..0.95))
+        }
+        _ => material.albedo,
+    };
+    material
+}
+
 fn aluminium(rng: &mut ChaCha8Rng) -> Material {
     let metal = rng.random_range(0.2..0.8);
     Material { albedo: grey(rng, 0.55, 0.9), metal, specular: 0.2, shininess: 20.0, ..MATT }
@@ -703,8 +720,8 @@ impl Support {
 
     /// Adds the support; returns the floor's height, where there is a floor.
     fn build(&self, build: &mut Builder, rng: &mut ChaCha8Rng) -> Option<f64> {
-        let material = if rng.random_bool(0.35) { aluminium(rng) } else { any_material(rng) };
-        let other = if rng.random_bool(0.5) { aluminium(rng) } else { any_material(rng) };
+        let material = if rng.random_bool(0.35) { aluminium(rng) } else { furniture(rng) };
+        let other = if rng.random_bool(0.5) { aluminium(rng) } else { furniture(rng) };
         let place = |x: f64, y: f64, z: f64| DAffine3::from_translation(DVec3::new(x, y, z));
         let height = match *self {
             Support::Nothing => 0.002,
@@ -884,12 +901,9 @@ impl Builder {
         away.z = 0.0;
         let away = away.normalize_or(DVec3::X);
         let mut plain = || {
-            let mut material = any_material(rng);
+            let mut material = furniture(rng);
             material.metal = 0.0;
             material.specular = 0.0;
-            if rng.random_bool(0.5) {
-                material.albedo = grey(rng, 0.4, 0.95);
-            }
             material
         };
         let (of_floor, of_wall, of_side) = (plain(), plain(), plain());
@@ -922,7 +936,7 @@ impl Builder {
             let bottom = floor.unwrap_or_else(|| rng.random_range(-1.0..0.2));
             let centre = DVec3::new(distance * yaw.cos(), distance * yaw.sin(), bottom + 0.5 * size.z);
             let turn = DQuat::from_rotation_z(rng.random_range(0.0..TAU));
-            let material = any_material(rng);
+            let material = furniture(rng);
             if self.clear(centre, 0.55 * size.length()) {
                 let pose = DAffine3::from_rotation_translation(turn, centre);
                 self.add(CUBOID, pose, size, material, Kind::Scenery);
@@ -1046,7 +1060,7 @@ fn lighting(rng: &mut ChaCha8Rng) -> Lighting {
     }
     // A light grey surface ends up between dim and nearly white.
     let total = sky + 0.6 * strengths.iter().sum::<f64>();
-    let exposure = rng.random_range(0.65..1.2) / total;
+    let exposure = rng.random_range(0.75..1.35) / total;
     let lamps = strengths.map(|strength| Lamp {
         direction: direction(rng, 0.25, 1.4),
         colour: warm(rng, strength * exposure),
