@@ -4,5 +4,9 @@
 //! pixel (0, 0) is the centre of the top-left pixel.
 
 mod intrinsics;
+mod lens;
+mod rectification;
 
 pub use intrinsics::Intrinsics;
+pub use lens::{Camera, Distortion};
+pub use rectification::Rectification;

@@ -1,0 +1,84 @@
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from whereabot_trainer import data
+from whereabot_trainer.networks import CAMERA, INPUT_HEIGHT, INPUT_WIDTH
+
+
+def test_halve_is_the_mean_of_each_block():
+    pixels = np.array([[0, 1, 10, 10], [2, 4, 10, 14]], np.uint8)
+    assert data.halve(pixels).tolist() == [[2, 11]]
+
+
+def test_reads_a_recording_and_its_growth(recording, tmp_path):
+    folder = tmp_path / "growing"
+    shutil.copytree(recording, folder)
+    lines = (recording / "samples.jsonl").read_text().splitlines(keepends=True)
+    (folder / "samples.jsonl").write_text("".join(lines[:7]) + lines[7][:30])
+    with pytest.warns(UserWarning, match="line 8 is unfinished"):
+        first = data.Samples([folder], tmp_path / "cache")
+    assert len(first) == 7
+    (folder / "samples.jsonl").write_text("".join(lines))
+    grown = data.Samples([folder], tmp_path / "cache")
+    whole = data.Samples([recording], tmp_path / "other")
+    numbers = np.arange(len(lines))
+    for left, right in zip(grown.pixels(numbers), whole.pixels(numbers), strict=True):
+        assert torch.equal(left, right)
+    assert whole.has_robot.sum() == 36 and whole.coverage[9] == 0
+    # What was on the validation side before stays there.
+    assert set(data.split(first, 1)[1]) == {n for n in data.split(grown, 1)[1] if n < 7}
+
+
+@pytest.mark.parametrize(("line", "complaint"), [
+    ("{\n", "line 3: "),
+    ('{"id": 2, "mask": "m"}\n', "line 3: image: expected a path"),
+    ('{"id":2,"image":"i","mask":"m","intrinsics":{"fx":500,"fy":365,"cx":255.5,"cy":211.5}}\n', "line 3: intrinsics: fx"),
+])
+def test_a_broken_line_is_named(recording, tmp_path, line, complaint):
+    folder = tmp_path / "broken"
+    shutil.copytree(recording, folder)
+    lines = (recording / "samples.jsonl").read_text().splitlines(keepends=True)
+    (folder / "samples.jsonl").write_text("".join([*lines[:2], line, *lines[3:]]))
+    with pytest.raises(data.RecordingError, match=f"samples.jsonl: {complaint}"):
+        data.Samples([folder], tmp_path / "cache")
+
+
+def _centroid(picture):
+    v, u = torch.meshgrid(torch.arange(INPUT_HEIGHT), torch.arange(INPUT_WIDTH), indexing="ij")
+    return torch.stack([(picture * u).sum(), (picture * v).sum()]) / picture.sum()
+
+
+def _project(points):
+    return torch.stack([CAMERA["fx"] * points[..., 0] / points[..., 2] + CAMERA["cx"],
+                        CAMERA["fy"] * points[..., 1] / points[..., 2] + CAMERA["cy"]], -1)
+
+
+def test_a_rotated_camera_sees_the_joints_where_the_image_shows_them():
+    torch.manual_seed(3)
+    joints = torch.tensor([[[0.2, -0.1, 1.5], [-0.3, 0.25, 1.8]]] * 4)
+    images = torch.zeros(4, 2, INPUT_HEIGHT, INPUT_WIDTH)
+    v, u = torch.meshgrid(torch.arange(INPUT_HEIGHT), torch.arange(INPUT_WIDTH), indexing="ij")
+    for channel, (x, y) in enumerate(_project(joints[0])):
+        images[:, channel] = torch.exp(-((u - x) ** 2 + (v - y) ** 2) / 18)
+    rotations = data.random_rotations(4)
+    warped, moved = data.rotate_camera(images, joints, rotations)
+    assert torch.allclose(moved.norm(dim=-1), joints.norm(dim=-1), atol=1e-6)
+    for sample in range(4):
+        for channel in range(2):
+            seen, expected = _centroid(warped[sample, channel]), _project(moved[sample, channel])
+            assert (seen - expected).norm() < 0.15, (seen, expected)
+            # The marker did move: an augmentation that does nothing must not pass.
+            assert (seen - _project(joints[sample, channel])).norm() > 0.5
+
+
+def test_views_keep_image_and_mask_together():
+    torch.manual_seed(0)
+    mask = torch.zeros(8, 1, INPUT_HEIGHT, INPUT_WIDTH)
+    mask[:, :, 60:150, 70:190] = 1
+    images, masks = data.random_views(mask.expand(-1, 3, -1, -1), mask, 128, 160)
+    assert images.shape == (8, 3, 128, 160)
+    assert ((images[:, :1] >= 0.5).float() == masks).all()
+    assert 0.1 < masks.mean() < 0.9

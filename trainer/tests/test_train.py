@@ -1,0 +1,130 @@
+import csv
+import json
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from whereabot_trainer import data, evaluate, golden
+from whereabot_trainer.__main__ import main
+from whereabot_trainer.export import choose_presence, read_model
+from whereabot_trainer.networks import JOINT_INPUT, Network, paper_joint_layers
+from whereabot_trainer.train import Standardised, load_network
+
+
+@pytest.fixture
+def train(recording, tmp_path):
+    def run(command, out, *flags):
+        main([command, "--recording", str(recording), "--out", str(tmp_path / out), "--cache", str(tmp_path / "cache"),
+              "--batch", "4", "--threads", "2", *flags])
+        return tmp_path / out
+    return run
+
+
+def _weights(run):
+    return torch.load(run / "last.pt", weights_only=False)["network"]
+
+
+def test_a_resumed_run_goes_on_as_if_never_stopped(train, monkeypatch):
+    flags = ("--iterations", "6", "--evaluate-every", "3", "--precision", "f32", "--crop", "32", "24",
+             "--validation-samples", "2")
+    whole = train("train-mask", "whole", *flags)
+
+    score, calls = evaluate.score_mask, []
+
+    def stop_at_the_second(*args):
+        calls.append(None)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return score(*args)
+
+    monkeypatch.setattr(evaluate, "score_mask", stop_at_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        train("train-mask", "parts", *flags)
+    half = {key: value.clone() for key, value in _weights(whole.parent / "parts").items()}
+    monkeypatch.setattr(evaluate, "score_mask", score)
+    parts = train("train-mask", "parts", *flags, "--resume")
+
+    for key, value in _weights(whole).items():
+        assert torch.equal(value, _weights(parts)[key]), key
+        assert not torch.equal(value, half[key]), f"{key} was not trained after the stop"
+    with open(parts / "log.csv") as file:
+        assert [row["iteration"] for row in csv.DictReader(file)] == ["3", "6"]
+
+
+def test_a_run_is_not_overwritten(train):
+    flags = ("--iterations", "1", "--crop", "32", "24", "--validation-samples", "1")
+    train("train-mask", "run", *flags)
+    with pytest.raises(SystemExit, match="--resume"):
+        train("train-mask", "run", *flags)
+
+
+def test_export_folds_calibration_and_standardisation(train, recording, tmp_path):
+    mask_run = train("train-mask", "mask", "--iterations", "3", "--crop", "32", "24", "--validation-samples", "4")
+    joint_run = train("train-joint", "joint", "--iterations", "3", "--pool", "4", "--validation-samples", "4",
+                      "--mask-run", str(mask_run), "--estimated-masks", "0.5")
+    path = tmp_path / "model.safetensors"
+    main(["export", "--mask", str(mask_run), "--joint", str(joint_run), "--validation", str(recording),
+          "--cache", str(tmp_path / "cache"), "--out", str(path)])
+    mask, joint, description = read_model(path)
+    assert description["card"]["figures"]["estimated_mask_mean_cm"] > 0
+
+    trained_mask, mask_state = load_network(mask_run)
+    trained_joint, joint_state = load_network(joint_run)
+    images, _ = data.Samples([recording], tmp_path / "cache").pixels([0, 1])
+    shift = mask_state["figures"]["logit_shift"]
+    assert torch.allclose(mask(images), torch.sigmoid(torch.logit(trained_mask(images)) + shift), atol=1e-5)
+    assert not torch.allclose(mask(images), trained_mask(images), atol=1e-2)
+    metres = Standardised(joint_state["card"]["mean"], joint_state["card"]["deviation"]).metres(trained_joint(images))
+    assert torch.allclose(joint(images).reshape(-1, 6, 3), metres, atol=1e-4)
+    assert not torch.allclose(joint(images), trained_joint(images), atol=1e-2)
+
+
+def test_presence_threshold_parts_the_two_kinds():
+    assert choose_presence([0.05, 0.08, 0.2], [0.0, 0.01, 0.002]) == (pytest.approx(0.0101), 1.0, 1.0)
+    least, passed, rejected = choose_presence([0.05, 0.08, 0.2], [0.0, 0.06, 0.002])
+    assert passed + rejected == pytest.approx(5 / 3), least
+
+
+def test_calibration_finds_the_best_threshold():
+    class Fixed(torch.nn.Module):
+        def forward(self, images):
+            # Robot pixels have a logit of 1 or 3, the background up to 1.9: 0.5 (logit 0) is not the best threshold.
+            return torch.sigmoid(images[:, :1])
+
+    class Made:
+        def pixels(self, numbers):
+            mask = torch.zeros(len(numbers), 1, 10, 10)
+            mask[..., :5] = 1
+            image = torch.where(mask > 0, 3.0, 1.9)
+            image[..., 0, 0] = 1.0
+            return image.expand(-1, 3, -1, -1), mask
+
+    figures = evaluate.score_mask(Fixed(), Made(), [0, 1], "cpu")
+    assert figures["iou"] == 0.5 and figures["calibrated_iou"] == pytest.approx(0.98, abs=1e-3)
+    assert -3.001 <= figures["logit_shift"] < -1.9
+
+
+def test_committed_golden_files_are_what_pytorch_computes(tmp_path, request):
+    committed = request.config.rootpath.parent / "tests" / "data" / "golden"
+    golden.write_golden(tmp_path)
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == sorted(path.name for path in committed.iterdir()) and len(names) == 6
+    for name in names:
+        made, kept = load_file(tmp_path / name), load_file(committed / name)
+        assert made.keys() == kept.keys()
+        for key in made:
+            assert torch.allclose(made[key].float(), kept[key].float(), atol=1e-6), (name, key)
+    mask, joint, description = read_model(committed / "tiny.safetensors")
+    mask.conv2.weight.data[0, 0, 1, 1] += 0.01
+    values = golden.cascade_activations(
+        mask, joint, description["overlay"], load_file(committed / "tiny.activations.safetensors")["mask.image"])
+    assert (values["joints"] - load_file(committed / "tiny.activations.safetensors")["joints"]).abs().max() > 1e-5
+
+
+def test_a_network_refuses_what_it_cannot_build():
+    layers = paper_joint_layers()
+    layers[1]["inputs"] = ["nowhere"]
+    with pytest.raises(ValueError, match="nowhere"):
+        Network(layers, JOINT_INPUT)
+    assert json.dumps(paper_joint_layers())

@@ -1,0 +1,115 @@
+"""The command line: `python -m whereabot_trainer COMMAND`."""
+
+import argparse
+
+import torch
+
+from . import export, golden, train
+
+
+def _training_flags(parser, *, minutes, batch, learning_rate, momentum, dilations):
+    parser.add_argument("--recording", nargs="+", required=True, metavar="DIR", help="recordings to train on")
+    parser.add_argument("--validation", nargs="+", metavar="DIR",
+                        help="recordings to validate on (without: a random fifth of the others)")
+    parser.add_argument("--validation-samples", type=int, default=100, metavar="N",
+                        help="validate on at most so many samples (%(default)s)")
+    parser.add_argument("--out", required=True, metavar="RUN", help="folder for checkpoints, log.csv and settings.json")
+    parser.add_argument("--resume", action="store_true", help="go on from RUN/last.pt")
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--minutes", type=float, default=minutes, metavar="M",
+                        help="train for so long, resumed parts included; learning rate and momentum follow the clock (%(default)s)")
+    length.add_argument("--iterations", type=int, metavar="N", help="train for N batches instead: reproducible")
+    parser.add_argument("--batch", type=int, default=batch, metavar="N", help="samples a batch (%(default)s)")
+    parser.add_argument("--dilations", type=_integers, default=dilations, metavar="D,D,...",
+                        help="dilation of each convolution (%(default)s)")
+    parser.add_argument("--optimizer", choices=("adamw", "sgd"), default="adamw", help="(%(default)s)")
+    parser.add_argument("--learning-rate", nargs=2, type=float, default=learning_rate, metavar=("START", "END"),
+                        help="cosine from START to END (%(default)s)")
+    parser.add_argument("--momentum", nargs=2, type=float, default=momentum, metavar=("START", "END"),
+                        help="momentum of SGD or beta1 of AdamW, growing linearly (%(default)s)")
+    parser.add_argument("--weight-decay", type=float, default=1e-4, metavar="W", help="(%(default)s)")
+    parser.add_argument("--clip-gradient", type=float, default=5.0, metavar="NORM", help="(%(default)s)")
+    parser.add_argument("--evaluate-every", type=int, default=500, metavar="N",
+                        help="validate and save every N batches (%(default)s)")
+    parser.add_argument("--precision", choices=("bf16", "f32"), default="bf16", help="of the training pass (%(default)s)")
+    _machine_flags(parser)
+
+
+def _machine_flags(parser):
+    parser.add_argument("--cache", default=".cache", metavar="DIR", help="folder for decoded, halved images (%(default)s)")
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="of weights, split and order (%(default)s)")
+    parser.add_argument("--threads", type=int, metavar="N", help="CPU threads (PyTorch's choice)")
+
+
+def _integers(text):
+    return tuple(int(part) for part in text.split(","))
+
+
+def _prepare(args):
+    args.device = "cuda" if torch.cuda.is_available() else "cpu"
+    torch.set_default_device(args.device)
+    torch.manual_seed(args.seed)
+    if args.threads:
+        torch.set_num_threads(args.threads)
+
+
+def _run(function):
+    def run(args):
+        _prepare(args)
+        function(args)
+    return run
+
+
+def main(argv=None):
+    parser = argparse.ArgumentParser(prog="whereabot_trainer", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    command = commands.add_parser("train-mask", help="train the mask network")
+    _training_flags(command, minutes=40, batch=16, learning_rate=(3e-3, 3e-5), momentum=(0.9, 0.9),
+                    dilations=(1, 2, 4, 8, 1))
+    command.add_argument("--crop", nargs=2, type=int, default=(160, 128), metavar=("W", "H"),
+                         help="pixels of a training crop (%(default)s)")
+    command.add_argument("--zoom", nargs=2, type=float, default=(0.7, 2.0), metavar=("LEAST", "MOST"),
+                         help="magnification of the crops (%(default)s)")
+    command.set_defaults(run=_run(train.train_mask))
+
+    command = commands.add_parser("train-joint", help="train the joint network")
+    _training_flags(command, minutes=35, batch=16, learning_rate=(1e-3, 1e-5), momentum=(0.9, 0.95), dilations=(1, 1, 1))
+    command.add_argument("--pool", type=int, default=2, metavar="P", help="size of both max-pools (%(default)s)")
+    command.add_argument("--mask-run", metavar="RUN", help="finished run of train-mask, to validate the full system")
+    command.add_argument("--estimated-masks", type=float, default=0.0, metavar="SHARE",
+                         help="share of training samples that see the mask run's masks instead of the true ones (%(default)s)")
+    command.add_argument("--estimated-after", type=float, default=0.0, metavar="PROGRESS",
+                         help="from this progress (0 to 1) on (%(default)s)")
+    command.add_argument("--min-coverage", type=float, default=0.005, metavar="SHARE",
+                         help="leave out samples with less of the robot in view (%(default)s)")
+    command.set_defaults(run=_run(train.train_joint))
+
+    command = commands.add_parser("export", help="write both networks as a model file")
+    command.add_argument("--mask", required=True, metavar="RUN")
+    command.add_argument("--joint", required=True, metavar="RUN")
+    command.add_argument("--validation", nargs="+", required=True, metavar="DIR",
+                         help="recordings to choose the presence threshold and measure the figures on")
+    command.add_argument("--validation-samples", type=int, default=100, metavar="N",
+                         help="choose on the first N in random order, as training did, and report on the rest (%(default)s)")
+    command.add_argument("--photos", metavar="DIR", help="annotated photos, to report the mask's IoU on")
+    command.add_argument("--annotations", metavar="FILE", help="annotations of --photos")
+    command.add_argument("--photos-without", nargs="*", default=[], metavar="DIR",
+                         help="photos without a robot, to choose the presence threshold on")
+    command.add_argument("--out", required=True, metavar="FILE")
+    command.add_argument("--dtype", choices=("f32", "f16"), default="f32", help="of the tensors (%(default)s)")
+    command.add_argument("--robot", default="ur5", help="(%(default)s)")
+    command.add_argument("--licence", default="MIT OR Apache-2.0", help="of the weights (%(default)s)")
+    _machine_flags(command)
+    command.set_defaults(run=_run(export.export_runs))
+
+    command = commands.add_parser("golden", help="write the golden files of the engine's tests")
+    command.add_argument("--out", required=True, metavar="DIR")
+    command.set_defaults(run=lambda args: golden.write_golden(args.out))
+
+    args = parser.parse_args(argv)
+    args.run(args)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,257 @@
+"""Recordings as training samples: reading, halving, caching, splitting and augmentation."""
+
+import hashlib
+import json
+import math
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from tqdm import tqdm
+
+from .networks import CAMERA, INPUT_HEIGHT, INPUT_WIDTH, JOINTS
+
+FORMAT, VERSION = "whereabot-recording", 1
+
+
+class RecordingError(Exception):
+    """A recording that cannot be read; the message names the file and the line."""
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+def read_header(folder):
+    """recording.json, checked against what the networks are trained for."""
+    path = Path(folder) / "recording.json"
+    try:
+        header = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{path}: {error}") from error
+    for key, expected in (("format", FORMAT), ("version", VERSION), ("joints", JOINTS),
+                          ("width", 2 * INPUT_WIDTH), ("height", 2 * INPUT_HEIGHT), ("frame", "camera_optical")):
+        if header.get(key) != expected:
+            raise RecordingError(f"{path}: {key}: expected {expected!r}, found {header.get(key)!r}")
+    return header
+
+
+def _check_sample(sample):
+    for key in ("image", "mask"):
+        if not isinstance(sample.get(key), str):
+            raise ValueError(f"{key}: expected a path, found {sample.get(key)!r}")
+    for key, value in CAMERA.items():
+        # Pixel (0, 0) is a pixel's centre: halving the image halves cx + 0.5.
+        found = sample["intrinsics"][key]
+        halved = found / 2 if key.startswith("f") else (found + 0.5) / 2 - 0.5
+        if abs(halved - value) > 1e-3:
+            raise ValueError(f"intrinsics: {key}: expected {value} at half size, found {halved}")
+    joints = sample.get("joints_m")
+    if joints is not None and (np.shape(joints) != (len(JOINTS), 3) or not np.isfinite(joints).all()):
+        raise ValueError(f"joints_m: expected {len(JOINTS)} finite points, found {joints!r}")
+
+
+def read_samples(folder):
+    """The samples of samples.jsonl. A last line without its end (the recording is still being written) is left out."""
+    path = Path(folder) / "samples.jsonl"
+    try:
+        lines = path.read_bytes().split(b"\n")
+    except OSError as error:
+        raise RecordingError(f"{path}: {error}") from error
+    if lines[-1]:
+        warnings.warn(f"{path}: line {len(lines)} is unfinished and left out", stacklevel=2)
+    samples = []
+    for number, line in enumerate(lines[:-1], start=1):
+        try:
+            sample = json.loads(line)
+            _check_sample(sample)
+        except (ValueError, KeyError, TypeError) as error:
+            raise RecordingError(f"{path}: line {number}: {error}") from error
+        samples.append(sample)
+    return samples
+
+
+def halve(pixels):
+    """The mean of every 2x2 block, in the same integer type; pixels [H, W, ...]."""
+    height, width, *rest = pixels.shape
+    blocks = pixels.reshape(height // 2, 2, width // 2, 2, *rest).astype(np.uint16)
+    return ((blocks.sum((1, 3)) + 2) // 4).astype(pixels.dtype)
+
+
+def _decode(folder, number, sample):
+    try:
+        with Image.open(folder / sample["image"]) as file:
+            image = np.asarray(file.convert("RGB"))
+        with Image.open(folder / sample["mask"]) as file:
+            mask = np.asarray(file.convert("L"))
+        for key, shape in (("image", image.shape[:2]), ("mask", mask.shape)):
+            if shape != (2 * INPUT_HEIGHT, 2 * INPUT_WIDTH):
+                raise ValueError(f"{key}: expected {2 * INPUT_WIDTH}x{2 * INPUT_HEIGHT} pixels, found {shape[1]}x{shape[0]}")
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{folder / 'samples.jsonl'}: line {number}: {error}") from error
+    return halve(image), (halve(mask) >= 128).astype(np.uint8)
+
+
+def _cached_pixels(folder, samples, cache):
+    """(images [N, 212, 256, 3], masks [N, 212, 256] of 0 and 1) as memory maps; only new samples are decoded."""
+    folder, cache = Path(folder).resolve(), Path(cache)
+    cache.mkdir(parents=True, exist_ok=True)
+    stem = f"{folder.name}-{hashlib.sha256(str(folder).encode()).hexdigest()[:8]}"
+    index = cache / f"{stem}.json"
+
+    def digest(count):
+        return hashlib.sha256(json.dumps(samples[:count]).encode()).hexdigest()
+
+    done = 0
+    if index.exists():
+        known = json.loads(index.read_text())
+        if known["count"] <= len(samples) and known["digest"] == digest(known["count"]):
+            done = known["count"]
+    shapes = {"images": (INPUT_HEIGHT, INPUT_WIDTH, 3), "masks": (INPUT_HEIGHT, INPUT_WIDTH)}
+    paths = {key: cache / f"{stem}.{key}.u8" for key in shapes}
+    if done < len(samples):
+        with open(paths["images"], "ab") as images, open(paths["masks"], "ab") as masks, ThreadPoolExecutor(2) as pool:
+            images.truncate(done * math.prod(shapes["images"]))
+            masks.truncate(done * math.prod(shapes["masks"]))
+            jobs = pool.map(lambda n: _decode(folder, n + 1, samples[n]), range(done, len(samples)))
+            for image, mask in tqdm(jobs, f"decoding {folder.name}", len(samples) - done, mininterval=5):
+                images.write(image.tobytes())
+                masks.write(mask.tobytes())
+        index.write_text(json.dumps({"count": len(samples), "digest": digest(len(samples))}))
+    return tuple(np.memmap(paths[key], np.uint8, "r", shape=(len(samples), *shape)) for key, shape in shapes.items())
+
+
+class Samples:
+    """Samples of one or more recordings, by number.
+
+    `joints` is [N, 6, 3] in metres in the camera's optical frame, NaN where there is no robot; `coverage` [N] is the
+    share of robot pixels; `ids` [N] are the samples' ids in their recordings.
+    """
+
+    def __init__(self, folders, cache):
+        self.parts, joints, coverage, ids, self.sources = [], [], [], [], []
+        for folder in folders:
+            header, samples = read_header(folder), read_samples(folder)
+            if not samples:
+                raise RecordingError(f"{folder}: no samples")
+            images, masks = _cached_pixels(folder, samples, cache)
+            self.parts.append((images, masks))
+            absent = np.full((len(JOINTS), 3), np.nan)
+            joints += [sample.get("joints_m", absent) for sample in samples]
+            coverage.append(masks.mean((1, 2)))
+            ids += [sample["id"] for sample in samples]
+            self.sources.append({"name": Path(folder).name, "samples": len(samples), **header.get("source", {})})
+        self.joints = np.asarray(joints, np.float32)
+        self.coverage = np.concatenate(coverage)
+        self.ids = np.asarray(ids)
+        self._starts = np.cumsum([0] + [len(images) for images, _ in self.parts])
+
+    def __len__(self):
+        return len(self.joints)
+
+    @property
+    def has_robot(self):
+        return ~np.isnan(self.joints[:, 0, 0])
+
+    def pixels(self, numbers):
+        """(images [N, 3, H, W] in [0, 1], masks [N, 1, H, W] of 0 and 1) as f32 tensors."""
+        images = np.empty((len(numbers), INPUT_HEIGHT, INPUT_WIDTH, 3), np.uint8)
+        masks = np.empty((len(numbers), INPUT_HEIGHT, INPUT_WIDTH), np.uint8)
+        for row, number in enumerate(numbers):
+            part = np.searchsorted(self._starts, number, "right") - 1
+            images[row] = self.parts[part][0][number - self._starts[part]]
+            masks[row] = self.parts[part][1][number - self._starts[part]]
+        return torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255, torch.from_numpy(masks)[:, None].float()
+
+
+def split(samples, seed, validation_share=0.2):
+    """(training, validation) numbers, at random by seed.
+
+    Each sample's side depends on its id alone, so a recording that has grown since keeps its split.
+    """
+    draws = np.array([np.random.default_rng([seed, int(number)]).random() for number in samples.ids])
+    return np.flatnonzero(draws >= validation_share), np.flatnonzero(draws < validation_share)
+
+
+# --- augmentation ----------------------------------------------------------------------------------------------------
+
+def _uniform(count, low, high, *shape):
+    return torch.empty(count, *shape).uniform_(low, high)
+
+
+def jitter_colours(images):
+    """Other light and another camera: gain, white balance, contrast, saturation, gamma, blur and noise."""
+    count = len(images)
+    gain = _uniform(count, 0.6, 1.4, 1, 1, 1) * _uniform(count, 0.88, 1.12, 3, 1, 1)
+    images = images * gain
+    grey = images.mean(1, keepdim=True)
+    images = grey + (images - grey) * _uniform(count, 0.4, 1.5, 1, 1, 1)
+    level = grey.mean((2, 3), keepdim=True)
+    images = level + (images - level) * _uniform(count, 0.7, 1.3, 1, 1, 1)
+    images = images.clamp(1e-3, 1) ** torch.exp(_uniform(count, -0.4, 0.4, 1, 1, 1))
+    soft = torch.nn.functional.avg_pool2d(images, 3, 1, 1, count_include_pad=False)
+    # Between sharpened (-0.5) and blurred (1).
+    images = torch.lerp(images, soft, _uniform(count, -0.5, 1, 1, 1, 1))
+    images = images + torch.randn_like(images) * _uniform(count, 0, 0.04, 1, 1, 1)
+    return images.clamp(0, 1)
+
+
+def random_views(images, masks, height, width, tilt_degrees=10, zoom=(0.7, 2.0)):
+    """Random crops of height x width: zoomed, tilted, and mirrored half of the time. For the mask network alone: an arm
+    is not its mirror image, and a zoom changes the camera."""
+    count, _, full_height, full_width = images.shape
+    step = 1 / torch.exp(_uniform(count, math.log(zoom[0]), math.log(zoom[1])))
+    angle = torch.deg2rad(_uniform(count, -tilt_degrees, tilt_degrees))
+    mirror = torch.where(torch.rand(count) < 0.5, -1.0, 1.0)
+    room_x = (full_width - width * step).clamp(min=0) / full_width
+    room_y = (full_height - height * step).clamp(min=0) / full_height
+    cos, sin = torch.cos(angle) * step, torch.sin(angle) * step
+    # grid_sample's coordinates run from -1 to 1 over the source's width and height.
+    theta = torch.stack([
+        torch.stack([mirror * cos * width / full_width, -sin * height / full_width, room_x * _uniform(count, -1, 1)], 1),
+        torch.stack([mirror * sin * width / full_height, cos * height / full_height, room_y * _uniform(count, -1, 1)], 1),
+    ], 1)
+    grid = torch.nn.functional.affine_grid(theta, [count, 1, height, width], align_corners=False)
+    both = torch.nn.functional.grid_sample(
+        torch.cat([images, masks], 1), grid, padding_mode="border", align_corners=False)
+    return both[:, :3], (both[:, 3:] >= 0.5).float()
+
+
+def random_rotations(count, pan_tilt_degrees=8, roll_degrees=10):
+    """Small camera rotations [N, 3, 3]."""
+    tilt, pan = (torch.deg2rad(_uniform(count, -pan_tilt_degrees, pan_tilt_degrees)) for _ in range(2))
+    roll = torch.deg2rad(_uniform(count, -roll_degrees, roll_degrees))
+    skew = torch.zeros(count, 3, 3)
+    skew[:, 1, 2], skew[:, 0, 2], skew[:, 0, 1] = -tilt, pan, -roll
+    return torch.linalg.matrix_exp(skew - skew.mT)
+
+
+def rotate_camera(images, joints, rotations, camera=CAMERA):
+    """What the camera would see after a rotation, and the joints in its new frame.
+
+    Exact for a pinhole camera: pixels move by the homography K R K^-1, joints [N, 6, 3] by R. Zero comes in from beyond
+    the image.
+    """
+    count, _, height, width = images.shape
+    k = torch.tensor([[camera["fx"], 0, camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1]])
+    back = k @ rotations.mT @ torch.linalg.inv(k)
+    v, u = torch.meshgrid(torch.arange(height, dtype=torch.float32), torch.arange(width, dtype=torch.float32), indexing="ij")
+    source = torch.stack([u, v, torch.ones_like(u)], -1).reshape(-1, 3) @ back.mT
+    source = source[..., :2] / source[..., 2:]
+    # Pixel centres are whole numbers here; grid_sample's -1 and 1 are the image's outer edges.
+    grid = (2 * source + 1) / torch.tensor([width, height]) - 1
+    warped = torch.nn.functional.grid_sample(images, grid.reshape(count, height, width, 2), align_corners=False)
+    return warped, joints @ rotations.mT
+
+
+def erase_rectangles(overlays, chance=0.5):
+    """Zeroes one random rectangle in some of the overlays: what an occluder leaves of the mask."""
+    overlays = overlays.clone()
+    _, _, height, width = overlays.shape
+    for picture in overlays:
+        if torch.rand(()) < chance:
+            h, w = (int(torch.randint(8, 64, ())) for _ in range(2))
+            y, x = int(torch.randint(0, height - h, ())), int(torch.randint(0, width - w, ()))
+            picture[:, y : y + h, x : x + w] = 0
+    return overlays

@@ -1,0 +1,107 @@
+"""The paper's figures (section 5) and what calibration needs, on samples that were not trained on."""
+
+import numpy as np
+import torch
+
+from . import losses
+from .networks import JOINTS
+
+BATCH = 8
+# Bins of the mask's logit, for IoU at every threshold at once.
+LOGIT_EDGES = np.linspace(-10, 10, 201)
+
+
+def _batches(numbers):
+    return (numbers[start : start + BATCH] for start in range(0, len(numbers), BATCH))
+
+
+def _last_bias(network):
+    return getattr(network, network.layers[-1]["name"]).bias
+
+
+def shift_logits(network, shift):
+    """Adds `shift` to the logit of a mask network, in place: exact, because the bias is inside the sigmoid."""
+    with torch.no_grad():
+        _last_bias(network).add_(shift)
+
+
+@torch.no_grad()
+def masks_of(network, images, bf16=False):
+    with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
+        return network(images.contiguous(memory_format=torch.channels_last)).float()
+
+
+def estimate_masks(network, samples, numbers, device, bf16=False):
+    """The mask network's answer for each sample as {number: uint8 [H, W]}, 255 for certain."""
+    answers = {}
+    for batch in _batches(numbers):
+        estimate = masks_of(network, samples.pixels(batch)[0].to(device), bf16)
+        for number, mask in zip(batch, estimate, strict=True):
+            answers[int(number)] = (mask[0] * 255).round().byte().cpu().numpy()
+    return answers
+
+
+def mask_histograms(network, samples, numbers, device):
+    """Pixels by logit: (robot, background), each [N, bins], for each of the samples."""
+    histograms = []
+    for batch in _batches(numbers):
+        images, masks = samples.pixels(batch)
+        estimate = masks_of(network, images.to(device)).cpu().double().clamp(1e-6, 1 - 1e-6)
+        logits = torch.log(estimate / (1 - estimate)).clamp(LOGIT_EDGES[0], LOGIT_EDGES[-1] - 1e-9).numpy()
+        for logit, mask in zip(logits, masks.numpy() > 0.5, strict=True):
+            histograms.append([np.histogram(logit[mask], LOGIT_EDGES)[0], np.histogram(logit[~mask], LOGIT_EDGES)[0]])
+    robot, background = np.asarray(histograms).transpose(1, 0, 2)
+    return robot, background
+
+
+def figures_by_threshold(robot, background):
+    """Accuracy, IoU, precision and recall at each of LOGIT_EDGES' lower edges as threshold.
+
+    IoU is the mean over the images that show a robot; the others are over all pixels.
+    """
+    hits, alarms = (part[:, ::-1].cumsum(1)[:, ::-1].astype(float) for part in (robot, background))
+    positives = hits[:, :1]
+    shown = positives[:, 0] > 0
+    iou = (hits / (positives + alarms))[shown].mean(0) if shown.any() else np.zeros(robot.shape[1])
+    total = robot.sum() + background.sum()
+    return {
+        "accuracy": (hits.sum(0) + background.sum() - alarms.sum(0)) / total, "iou": iou,
+        "precision": hits.sum(0) / np.maximum(hits.sum(0) + alarms.sum(0), 1),
+        "recall": hits.sum(0) / max(robot.sum(), 1),
+    }
+
+
+def score_mask(network, samples, numbers, device):
+    """Figures at the threshold 0.5, and the shift of the logit that gives the best IoU there."""
+    curves = figures_by_threshold(*mask_histograms(network, samples, numbers, device))
+    half = int(np.argmin(np.abs(LOGIT_EDGES[:-1])))
+    best = int(curves["iou"].argmax())
+    figures = {name: round(float(curve[half]), 4) for name, curve in curves.items()}
+    return figures | {"calibrated_iou": round(float(curves["iou"][best]), 4),
+                      "calibrated_accuracy": round(float(curves["accuracy"][best]), 4),
+                      "logit_shift": round(float(-LOGIT_EDGES[best]), 3)}
+
+
+@torch.no_grad()
+def joint_errors(network, metres, samples, numbers, estimated, device):
+    """Distances [N, 6] in metres with the true masks, or with `estimated` ones."""
+    errors = []
+    for batch in _batches(numbers):
+        images, masks = samples.pixels(batch)
+        if estimated is not None:
+            masks = torch.stack([torch.from_numpy(estimated[int(number)])[None].float() / 255 for number in batch])
+        outputs = network((images * masks).to(device).contiguous(memory_format=torch.channels_last))
+        truth = torch.from_numpy(samples.joints[batch])
+        errors.append(losses.joint_distances(metres(outputs).cpu(), truth).numpy())
+    return np.concatenate(errors)
+
+
+def score_joints(network, metres, samples, numbers, estimated, device, name):
+    """Mean and median over samples of the error in centimetres, each sample's being the mean over its joints."""
+    each = 100 * joint_errors(network, metres, samples, numbers, estimated, device).mean(1)
+    return {f"{name}_mean_cm": round(float(each.mean()), 2), f"{name}_median_cm": round(float(np.median(each)), 2)}
+
+
+def identity_metres(outputs):
+    """The joints [N, 6, 3] of an exported joint network, whose outputs are metres."""
+    return outputs.reshape(-1, len(JOINTS), 3)

@@ -1,0 +1,148 @@
+"""The model file: both networks' tensors and, in the metadata key `whereabot`, the JSON that describes them."""
+
+import json
+import os
+
+import numpy as np
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+
+from . import __version__, data, evaluate, photos
+from .networks import CAMERA, INPUT_HEIGHT, INPUT_WIDTH, JOINT_INPUT, JOINTS, MASK_INPUT, Network
+from .train import Standardised, load_network
+
+DTYPES = {"f32": torch.float32, "f16": torch.float16}
+
+
+def describe(mask_layers, joint_layers, *, robot, overlay, presence, card,
+             width=INPUT_WIDTH, height=INPUT_HEIGHT, camera=CAMERA):
+    """The description that the engine reads from the model file."""
+    return {
+        "version": 1, "family": "paper", "robot": robot, "joints": JOINTS,
+        "input": {"width": width, "height": height}, "camera": camera,
+        "mask_network": {"layers": mask_layers}, "overlay": overlay,
+        "joint_network": {"layers": joint_layers}, "presence": presence, "card": card,
+    }
+
+
+def write_model(path, mask, joint, description, dtype="f32"):
+    """Writes both networks and their description as one safetensors file."""
+    tensors = {}
+    for prefix, network in (("mask", mask), ("joint", joint)):
+        for key, tensor in network.state_dict().items():
+            tensor = tensor.detach().cpu().to(DTYPES[dtype])
+            if not torch.isfinite(tensor).all():
+                raise ValueError(f"{prefix}.{key} is not finite in {dtype}")
+            tensors[f"{prefix}.{key}"] = tensor.contiguous(memory_format=torch.contiguous_format)
+    # A reader must never see half a file: write beside it, then rename.
+    partial = f"{path}.partial"
+    save_file(tensors, partial, metadata={"whereabot": json.dumps(description)})
+    os.replace(partial, path)
+
+
+def read_model(path):
+    """(mask network, joint network, description) of a model file; weights in f32."""
+    with safe_open(path, framework="pt") as file:
+        description = json.loads(file.metadata()["whereabot"])
+        tensors = {key: file.get_tensor(key).float() for key in file.keys()}
+    shape = (3, description["input"]["height"], description["input"]["width"])
+    networks = []
+    for prefix, source in (("mask", MASK_INPUT), ("joint", JOINT_INPUT)):
+        network = Network(description[f"{prefix}_network"]["layers"], source, shape)
+        network.load_state_dict({
+            key.removeprefix(f"{prefix}."): tensor for key, tensor in tensors.items() if key.startswith(f"{prefix}.")})
+        networks.append(network.eval())
+    return *networks, description
+
+
+# --- from training runs to a model file ------------------------------------------------------------------------------
+
+def choose_presence(robot, without):
+    """The least mask coverage at which a robot counts as seen: the value that passes the most robots and rejects the
+    most images without one, the two rates weighed equally. `robot` and `without` are coverages."""
+    robot, without = np.asarray(robot), np.asarray(without)
+    # Below a thousandth of the image (54 pixels) nothing can be said about a robot's joints.
+    candidates = np.unique(np.concatenate([[0.001], np.round(np.concatenate([robot, without]) + 1e-4, 4)]))
+    candidates = candidates[candidates >= 0.001]
+    merit = [(robot >= least).mean() + (without < least).mean() for least in candidates]
+    least = float(candidates[int(np.argmax(merit))])
+    return least, float((robot >= least).mean()), float((without < least).mean())
+
+
+def export_runs(args):
+    """Folds calibration and standardisation into the weights, measures the cascade, and writes the model file."""
+    mask, mask_state = load_network(args.mask)
+    joint, joint_state = load_network(args.joint)
+    shift = mask_state["figures"]["logit_shift"]
+    evaluate.shift_logits(mask, shift)
+    Standardised(joint_state["card"]["mean"], joint_state["card"]["deviation"]).fold(
+        getattr(joint, joint.layers[-1]["name"]))
+
+    samples = data.Samples(args.validation, args.cache)
+    # The first part chose the checkpoints and chooses the presence threshold; the rest is what the figures are about.
+    order = np.random.default_rng(args.seed).permutation(len(samples))
+    chosen, reported = order[: args.validation_samples], np.sort(order[args.validation_samples :])
+    if len(reported) < args.validation_samples:
+        chosen = reported = np.arange(len(samples))
+
+    coverage = {}
+    estimated = evaluate.estimate_masks(mask, samples, order, args.device)
+    for number, estimate in estimated.items():
+        coverage[number] = float((estimate >= 128).mean())
+    seen = samples.has_robot & (samples.coverage >= joint_state["card"]["min_coverage"])
+    empty = samples.coverage == 0
+    without = [coverage[n] for n in chosen if empty[n]]
+    photos_without = {}
+    for folder in args.photos_without:
+        photos_without |= photos.coverages(mask, folder)
+    least, _, _ = choose_presence(
+        [coverage[n] for n in chosen if seen[n]], without + list(photos_without.values()))
+
+    robots = reported[seen[reported]]
+    figures = evaluate.score_mask(mask, samples, reported, args.device)
+    for name, masks in (("true_mask", None), ("estimated_mask", estimated)):
+        figures |= evaluate.score_joints(joint, evaluate.identity_metres, samples, robots, masks, args.device, name)
+    found = robots[[coverage[n] >= least for n in robots]]
+    figures |= {"found_" + key: value for key, value in evaluate.score_joints(
+        joint, evaluate.identity_metres, samples, found, estimated, args.device, "estimated_mask").items()}
+    nothing = [coverage[n] for n in reported if empty[n]]
+    figures["presence"] = {
+        "robots_found": _rate([coverage[n] >= least for n in robots]),
+        "images_without_robot_rejected": _rate([value < least for value in nothing]),
+        "photos_without_robot_rejected": _rate([value < least for value in photos_without.values()]),
+    }
+    figures["samples"] = {"chosen_on": len(chosen), "reported_on": len(reported), "with_robot": len(robots)}
+    if args.photos:
+        scores = photos.score_annotated(mask, args.photos, args.annotations)
+        figures["photos"] = {"mean_iou": round(float(np.mean(list(scores.values()))), 3),
+                             "median_iou": round(float(np.median(list(scores.values()))), 3), "count": len(scores)}
+        print(json.dumps(scores, indent=1))
+
+    card = {
+        "task": "mask and joints (metres, camera optical frame) of one robot arm in one colour image",
+        "data": {"training": joint_state["card"]["training_recordings"], "validation": samples.sources},
+        "mask_training": _training(mask_state), "joint_training": _training(joint_state),
+        "calibration": {"logit_shift": shift, "why": "inverse class weights bias the mask towards the robot; the shift"
+                        " that gives the best validation IoU at 0.5 is added to the last bias"},
+        "figures": figures, "trainer": f"whereabot-trainer {__version__}, torch {torch.__version__.split('+')[0]}",
+        "licence": args.licence,
+    }
+    description = describe(
+        mask.layers, joint.layers, robot=args.robot, overlay={"rule": "multiply"},
+        presence={"mask_threshold": 0.5, "min_coverage": least}, card=card)
+    write_model(args.out, mask, joint, description, args.dtype)
+    print(json.dumps({"presence": description["presence"], **figures}, indent=1))
+    print(f"{args.out}: {os.path.getsize(args.out) / 1e6:.2f} MB")
+
+
+def _rate(hits):
+    return f"{sum(hits)} of {len(hits)}"
+
+
+def _training(state):
+    keep = ("protocol", "seed", "precision", "optimizer", "learning_rate", "momentum", "batch", "samples", "crop", "zoom",
+            "foreground_share", "w_fg", "w_bg", "estimated_masks", "estimated_after")
+    return {key: state["card"][key] for key in keep if key in state["card"]} | {
+        "minutes": round(state["seconds"] / 60, 1), "iterations": state["iteration"],
+        "samples_available": sum(source["samples"] for source in state["card"]["training_recordings"])}

@@ -1,0 +1,99 @@
+"""Golden files: small cascades, and what PyTorch makes of them layer by layer, for the engine's tests.
+
+`NAME.safetensors` is a complete model file. `NAME.activations.safetensors` holds, in f32 and without a batch
+dimension, the input `mask.image`, every layer's output as `mask.{layer}` and `joint.{layer}`, the joint network's
+input `joint.overlay`, and the cascade's result `joints` [18].
+"""
+
+from pathlib import Path
+
+import torch
+from safetensors.torch import save_file
+
+from .export import describe, read_model, write_model
+from .networks import JOINT_INPUT, JOINTS, MASK_INPUT, Network, overlay
+
+WIDTH, HEIGHT = 20, 14
+# Odd channel counts, a dilation beyond the image's height, and kernels of 1 and 5 find layout and padding errors.
+MASK_LAYERS = [
+    {"name": "conv1", "op": "conv2d", "inputs": ["image"], "out_channels": 5, "kernel": 3, "dilation": 1,
+     "activation": "relu"},
+    {"name": "conv2", "op": "conv2d", "inputs": ["conv1"], "out_channels": 3, "kernel": 3, "dilation": 17,
+     "activation": "none"},
+    {"name": "conv3", "op": "conv2d", "inputs": ["conv2"], "out_channels": 6, "kernel": 5, "dilation": 2,
+     "activation": "sigmoid"},
+    {"name": "conv4", "op": "conv2d", "inputs": ["conv3"], "out_channels": 1, "kernel": 1, "dilation": 1,
+     "activation": "none"},
+    {"name": "mask", "op": "sigmoid", "inputs": ["conv4"]},
+]
+# 14 x 20 pools by 2 to 7 x 10, and by 3 to 2 x 3: a row and a column are left over.
+JOINT_LAYERS = [
+    {"name": "conv1", "op": "conv2d", "inputs": ["overlay"], "out_channels": 5, "kernel": 3, "dilation": 2,
+     "activation": "relu"},
+    {"name": "pool1", "op": "max_pool2d", "inputs": ["conv1"], "size": 2},
+    {"name": "conv2", "op": "conv2d", "inputs": ["pool1"], "out_channels": 7, "kernel": 3, "dilation": 1,
+     "activation": "none"},
+    {"name": "pool2", "op": "max_pool2d", "inputs": ["conv2"], "size": 3},
+    {"name": "conv3", "op": "conv2d", "inputs": ["pool2"], "out_channels": 9, "kernel": 3, "dilation": 5,
+     "activation": "relu"},
+    {"name": "dense", "op": "dense", "inputs": ["conv3"], "out_features": 3 * len(JOINTS), "activation": "none"},
+]
+CARD = {"data": "none: random weights", "purpose": "golden files of whereabot's tests"}
+
+
+def _networks(seed, image):
+    torch.manual_seed(seed)
+    shape = (3, HEIGHT, WIDTH)
+    mask = Network(MASK_LAYERS, MASK_INPUT, shape)
+    joint = Network(JOINT_LAYERS, JOINT_INPUT, shape)
+    # Default weights give a mask that is nearly the same all over, and a dead first layer behind it: spread the values
+    # and centre the mask on 0.5, so that a wrong layer shows.
+    with torch.no_grad():
+        mask.conv1.weight *= 3
+        mask.conv3.weight *= 3
+        mask.conv4.weight *= 8
+        logits = mask.activations(image[None])["conv4"].flatten().sort().values
+        middle = logits[len(logits) // 4 : 3 * len(logits) // 4]
+        # No pixel may lie near the threshold, where rounding could flip it: put 0.5 in the middle's widest gap.
+        gap = middle.diff().argmax()
+        mask.conv4.bias -= (middle[gap] + middle[gap + 1]) / 2
+        joint.conv1.weight *= 3
+        joint.conv1.bias += 0.2
+        joint.conv2.weight *= 3
+        joint.conv3.weight *= 3
+        joint.dense.bias[2::3] += 1.5
+    return mask, joint
+
+
+@torch.no_grad()
+def cascade_activations(mask, joint, rule, image):
+    """Every value of the cascade on one image [3, H, W], by `{network}.{layer}`."""
+    values = {f"mask.{name}": value[0] for name, value in mask.activations(image[None]).items()}
+    seen = overlay(image[None], values["mask.mask"][None], rule)
+    values |= {f"joint.{name}": value[0] for name, value in joint.activations(seen).items()}
+    values["joints"] = values["joint.dense"].clone()
+    return {name: value.contiguous() for name, value in values.items()}
+
+
+def write_golden(folder, seed=1):
+    """Writes the models `tiny`, `threshold` and `tiny_f16` with their activations."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.use_deterministic_algorithms(True)
+    torch.set_num_threads(1)
+    image = torch.rand((3, HEIGHT, WIDTH), generator=torch.Generator().manual_seed(seed))
+    mask, joint = _networks(seed, image)
+    camera = {"fx": 14.25, "fy": 14.25, "cx": (WIDTH - 1) / 2, "cy": (HEIGHT - 1) / 2}
+    multiply, threshold = {"rule": "multiply"}, {"rule": "threshold", "threshold": 0.5}
+    for name, rule, dtype in (("tiny", multiply, "f32"), ("threshold", threshold, "f32"), ("tiny_f16", multiply, "f16")):
+        description = describe(
+            MASK_LAYERS, JOINT_LAYERS, robot="golden", overlay=rule, camera=camera, width=WIDTH, height=HEIGHT,
+            presence={"mask_threshold": 0.5, "min_coverage": 0.01}, card=CARD)
+        path = folder / f"{name}.safetensors"
+        write_model(path, mask, joint, description, dtype)
+        stored_mask, stored_joint, _ = read_model(path)
+        values = cascade_activations(stored_mask, stored_joint, rule, image)
+        margin = (values["mask.mask"] - 0.5).abs().min().item()
+        if margin < 1e-3:
+            raise ValueError(f"a pixel of the mask is {margin:.1e} from the threshold: take another seed")
+        save_file(values, folder / f"{name}.activations.safetensors")

@@ -1,0 +1,124 @@
+"""Networks built from the layer lists that travel in the model file.
+
+A network is a list of layers. Each layer is a dict with a unique `name`, an `op`, and the names of its `inputs`;
+the last layer is the network's output. The engine builds its kernels from the same list, so nothing about a
+network is known here that the model file does not say.
+"""
+
+import math
+
+import torch
+from torch import nn
+
+JOINTS = ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"]
+INPUT_WIDTH, INPUT_HEIGHT = 256, 212
+CAMERA = {"fx": 182.5, "fy": 182.5, "cx": 127.5, "cy": 105.5}
+
+MASK_INPUT = "image"
+JOINT_INPUT = "overlay"
+
+
+def paper_mask_layers(dilations=(1, 2, 4, 8, 1)):
+    """The paper's mask network: four dilated convolutions of 32 filters and one of one filter, all 3x3."""
+    layers, source = [], MASK_INPUT
+    for number, dilation in enumerate(dilations, start=1):
+        last = number == len(dilations)
+        layers.append({
+            "name": f"conv{number}", "op": "conv2d", "inputs": [source], "out_channels": 1 if last else 32,
+            "kernel": 3, "dilation": dilation, "activation": "sigmoid" if last else "relu",
+        })
+        source = layers[-1]["name"]
+    return layers
+
+
+def paper_joint_layers(dilations=(1, 1, 1), pool=2, outputs=18):
+    """The paper's joint network: convolutions of 32, 64 and 128 filters, max-pooling between them, and a dense layer."""
+    layers, source = [], JOINT_INPUT
+    for number, (filters, dilation) in enumerate(zip((32, 64, 128), dilations, strict=True), start=1):
+        layers.append({
+            "name": f"conv{number}", "op": "conv2d", "inputs": [source], "out_channels": filters,
+            "kernel": 3, "dilation": dilation, "activation": "relu",
+        })
+        source = f"conv{number}"
+        if number < 3:
+            layers.append({"name": f"pool{number}", "op": "max_pool2d", "inputs": [source], "size": pool})
+            source = f"pool{number}"
+    layers.append({
+        "name": "dense", "op": "dense", "inputs": [source], "out_features": outputs, "activation": "none",
+    })
+    return layers
+
+
+class Network(nn.Module):
+    """A layer list as a PyTorch module; its state_dict keys are `{layer}.weight` and `{layer}.bias`.
+
+    `shape` is the input's (channels, height, width). Tensors are NCHW.
+    """
+
+    def __init__(self, layers, input_name, shape=(3, INPUT_HEIGHT, INPUT_WIDTH)):
+        super().__init__()
+        self.layers = layers
+        self.input_name = input_name
+        shapes = {input_name: tuple(shape)}
+        for layer in layers:
+            name, op = layer["name"], layer["op"]
+            if name in shapes or hasattr(self, name):
+                raise ValueError(f"layer name {name!r} is taken")
+            (source,) = layer["inputs"]
+            if source not in shapes:
+                raise ValueError(f"layer {name!r} reads {source!r}, which no earlier layer makes")
+            channels, *size = shapes[source]
+            if op == "conv2d":
+                kernel, dilation = layer["kernel"], layer["dilation"]
+                self.add_module(name, nn.Conv2d(
+                    channels, layer["out_channels"], kernel, dilation=dilation, padding=dilation * (kernel - 1) // 2))
+                shapes[name] = (layer["out_channels"], *size)
+            elif op == "max_pool2d":
+                shapes[name] = (channels, *(extent // layer["size"] for extent in size))
+            elif op == "dense":
+                self.add_module(name, nn.Linear(math.prod(shapes[source]), layer["out_features"]))
+                shapes[name] = (layer["out_features"],)
+            elif op == "sigmoid":
+                shapes[name] = shapes[source]
+            else:
+                raise ValueError(f"layer {name!r} has the unknown op {op!r}")
+        self.shapes = shapes
+
+    def activations(self, x):
+        """Every layer's output by the layer's name, and the input by its own."""
+        values = {self.input_name: x}
+        for layer in self.layers:
+            name, op = layer["name"], layer["op"]
+            value = values[layer["inputs"][0]]
+            if op == "conv2d":
+                value = getattr(self, name)(value)
+            elif op == "max_pool2d":
+                value = nn.functional.max_pool2d(value, layer["size"])
+            elif op == "dense":
+                # In bfloat16 the rounding of coordinates alone would cost millimetres.
+                with torch.autocast(value.device.type, enabled=False):
+                    value = getattr(self, name)(value.float().flatten(1))
+            elif op == "sigmoid":
+                value = torch.sigmoid(value.float())
+            activation = layer.get("activation", "none")
+            if activation == "relu":
+                value = torch.relu(value)
+            elif activation == "sigmoid":
+                # In bfloat16 the sigmoid is exactly 1 from a logit of 6 on.
+                value = torch.sigmoid(value.float())
+            elif activation != "none":
+                raise ValueError(f"layer {name!r} has the unknown activation {activation!r}")
+            values[name] = value
+        return values
+
+    def forward(self, x):
+        return self.activations(x)[self.layers[-1]["name"]]
+
+
+def overlay(image, mask, rule):
+    """The joint network's input: the image [N, 3, H, W] where the mask [N, 1, H, W] says robot."""
+    if rule["rule"] == "threshold":
+        mask = (mask >= rule["threshold"]).to(image.dtype)
+    elif rule["rule"] != "multiply":
+        raise ValueError(f"unknown overlay rule {rule['rule']!r}")
+    return image * mask

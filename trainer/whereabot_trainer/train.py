@@ -1,0 +1,266 @@
+"""The training loop, and the two tasks it runs: the mask network and the joint network, trained separately."""
+
+import csv
+import json
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from . import data, evaluate, losses
+from .networks import JOINT_INPUT, JOINTS, MASK_INPUT, Network, paper_joint_layers, paper_mask_layers
+
+
+# --- the loop --------------------------------------------------------------------------------------------------------
+
+class Schedule:
+    """Learning rate and momentum over the progress (0 to 1) of a run: a cosine from start to end, after a short warm-up
+    of the rate; momentum changes linearly. For AdamW, momentum is beta1."""
+
+    WARM_UP = 0.01
+
+    def __init__(self, learning_rate, momentum):
+        self.learning_rate, self.momentum = learning_rate, momentum
+
+    def apply(self, optimizer, progress):
+        start, end = self.learning_rate
+        rate = end + (start - end) * 0.5 * (1 + math.cos(math.pi * progress))
+        rate *= min(1, (progress + 1e-3) / self.WARM_UP)
+        momentum = self.momentum[0] + (self.momentum[1] - self.momentum[0]) * progress
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+            if "betas" in group:
+                group["betas"] = (momentum, group["betas"][1])
+            else:
+                group["momentum"] = momentum
+        return rate
+
+
+def make_optimizer(name, parameters, weight_decay):
+    if name == "sgd":
+        return torch.optim.SGD(parameters, lr=0.0, momentum=0.9, weight_decay=weight_decay)
+    return torch.optim.AdamW(parameters, lr=0.0, betas=(0.9, 0.99), weight_decay=weight_decay)
+
+
+class Order:
+    """Batches of sample numbers in a random order, each sample once an epoch."""
+
+    def __init__(self, numbers, batch):
+        self.numbers, self.batch = np.asarray(numbers), batch
+        self.state = {"epoch": 0, "position": 0, "count": len(self.numbers), "order": None}
+
+    def __next__(self):
+        state = self.state
+        if state["order"] is None or state["count"] != len(self.numbers) or state["position"] >= len(self.numbers):
+            state["epoch"] += state["order"] is not None
+            state["order"] = torch.randperm(len(self.numbers), device="cpu").numpy()
+            state["position"], state["count"] = 0, len(self.numbers)
+        taken = state["order"][state["position"] : state["position"] + self.batch]
+        state["position"] += self.batch
+        return self.numbers[taken]
+
+
+def fit(args, network, numbers, batch_loss, score, better, card):
+    """Trains `network` in the folder args.out.
+
+    `batch_loss(numbers, progress)` is the loss of a batch, `score()` the validation figures as a dict, of which
+    `better(figures)` is to be largest in best.pt. `card` goes into the checkpoints.
+    """
+    out = Path(args.out)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "settings.json").write_text(json.dumps(vars(args), indent=1, default=str) + "\n")
+    optimizer = make_optimizer(args.optimizer, network.parameters(), args.weight_decay)
+    schedule = Schedule(args.learning_rate, args.momentum)
+    order = Order(numbers, args.batch)
+    iteration, before, best = 0, 0.0, -math.inf
+    last = out / "last.pt"
+    if args.resume:
+        state = torch.load(last, weights_only=False)
+        network.load_state_dict(state["network"])
+        optimizer.load_state_dict(state["optimizer"])
+        order.state, iteration, before, best = state["order"], state["iteration"], state["seconds"], state["best"]
+        torch.set_rng_state(state["rng"])
+    elif last.exists():
+        raise SystemExit(f"{out} holds a run already: add --resume to go on with it, or choose another folder")
+
+    def save(path, **more):
+        partial = path.with_suffix(".partial")
+        torch.save({"layers": network.layers, "network": network.state_dict(), "card": card,
+                    "iteration": iteration, "seconds": seconds, **more}, partial)
+        partial.replace(path)
+
+    started, seconds, total, counted = time.monotonic(), before, 0.0, 0
+    budget = args.iterations or 60 * args.minutes
+    progress = (iteration if args.iterations else before) / budget
+    with tqdm(total=1.0, initial=min(progress, 1), bar_format="{l_bar}{bar}| {elapsed} {postfix}", mininterval=10) as bar:
+        while progress < 1:
+            network.train()
+            rate = schedule.apply(optimizer, progress)
+            with torch.autocast(args.device, torch.bfloat16, enabled=args.precision == "bf16"):
+                loss = batch_loss(next(order), progress)
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(network.parameters(), args.clip_gradient)
+            optimizer.step()
+            iteration += 1
+            total, counted = total + loss.item(), counted + 1
+            seconds = before + time.monotonic() - started
+            progress = (iteration if args.iterations else seconds) / budget
+            if iteration % args.evaluate_every == 0 or progress >= 1:
+                network.eval()
+                figures = {"iteration": iteration, "epoch": order.state["epoch"], "seconds": round(seconds, 1),
+                           "learning_rate": f"{rate:.3g}", "train_loss": round(total / counted, 5), **score()}
+                total, counted = 0.0, 0
+                _append_csv(out / "log.csv", figures)
+                if better(figures) > best:
+                    best = better(figures)
+                    save(out / "best.pt", figures=figures)
+                save(last, optimizer=optimizer.state_dict(), order=order.state, best=best, rng=torch.get_rng_state())
+                bar.set_postfix({key: figures[key] for key in list(figures)[4:]})
+                seconds = before + time.monotonic() - started
+                progress = max(progress, (iteration if args.iterations else seconds) / budget)
+            bar.update(min(progress, 1) - bar.n)
+
+
+def _append_csv(path, row):
+    new = not path.exists()
+    with open(path, "a", newline="") as file:
+        writer = csv.DictWriter(file, list(row))
+        if new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+# --- what both tasks share -------------------------------------------------------------------------------------------
+
+def load_samples(args):
+    """(training samples, their numbers, validation samples, their numbers, the card's account of both)."""
+    samples = data.Samples(args.recording, args.cache)
+    if args.validation:
+        held_out, numbers = data.Samples(args.validation, args.cache), np.arange(len(samples))
+        validation = np.arange(len(held_out))
+        protocol = "validated on recordings of their own"
+    else:
+        held_out = samples
+        numbers, validation = data.split(samples, args.seed)
+        protocol = "80/20 random split"
+    if len(validation) > args.validation_samples:
+        validation = np.random.default_rng(args.seed).permutation(validation)[: args.validation_samples]
+    card = {
+        "training_recordings": samples.sources, "validation_recordings": held_out.sources if args.validation else [],
+        "protocol": protocol, "seed": args.seed, "precision": args.precision, "optimizer": args.optimizer,
+        "learning_rate": args.learning_rate, "momentum": args.momentum, "batch": args.batch,
+        "minutes": args.minutes, "iterations": args.iterations,
+    }
+    return samples, numbers, held_out, np.sort(validation), card
+
+
+def load_network(run, name="best.pt"):
+    """(network in eval mode, checkpoint) of a run; the network's input is told from its first layer."""
+    state = torch.load(Path(run) / name, weights_only=False, map_location="cpu")
+    network = Network(state["layers"], state["layers"][0]["inputs"][0])
+    network.load_state_dict(state["network"])
+    return network.eval(), state
+
+
+# --- the mask network ------------------------------------------------------------------------------------------------
+
+def train_mask(args):
+    samples, numbers, held_out, validation, card = load_samples(args)
+    share = float(samples.coverage[numbers].mean())
+    w_fg, w_bg = losses.class_weights(share)
+    height, width = args.crop[1], args.crop[0]
+    card |= {"foreground_share": share, "w_fg": w_fg, "w_bg": w_bg, "crop": args.crop, "zoom": args.zoom}
+    network = Network(paper_mask_layers(args.dilations), MASK_INPUT).to(args.device, memory_format=torch.channels_last)
+
+    def batch_loss(batch, _progress):
+        images, masks = (tensor.to(args.device) for tensor in samples.pixels(batch))
+        images, masks = data.random_views(images, masks, height, width, zoom=args.zoom)
+        images = data.jitter_colours(images)
+        estimate = network(images.contiguous(memory_format=torch.channels_last))
+        return losses.mask_loss(estimate, masks, w_fg, w_bg)
+
+    def score():
+        return evaluate.score_mask(network, held_out, validation, args.device)
+
+    fit(args, network, numbers, batch_loss, score, lambda figures: figures["calibrated_iou"], card)
+
+
+# --- the joint network -----------------------------------------------------------------------------------------------
+
+class Standardised:
+    """Joints [N, 6, 3] in metres and the network's 18 outputs, which have mean 0 and deviation 1 over the training set.
+
+    Export folds this into the dense layer, so the engine never meets it.
+    """
+
+    def __init__(self, mean, deviation):
+        self.mean, self.deviation = torch.as_tensor(mean), torch.as_tensor(deviation)
+
+    @classmethod
+    def of(cls, joints):
+        flat = joints.reshape(len(joints), -1)
+        return cls(flat.mean(0), flat.std(0).clip(min=1e-3))
+
+    def metres(self, outputs):
+        return (outputs.float() * self.deviation + self.mean).reshape(-1, len(JOINTS), 3)
+
+    def fold(self, dense):
+        """Changes the last layer in place so that its outputs are metres."""
+        with torch.no_grad():
+            dense.weight *= self.deviation[:, None]
+            dense.bias.copy_(dense.bias * self.deviation + self.mean)
+
+
+def train_joint(args):
+    samples, numbers, held_out, validation, card = load_samples(args)
+    numbers, validation = (
+        chosen[part.has_robot[chosen] & (part.coverage[chosen] >= args.min_coverage)]
+        for part, chosen in ((samples, numbers), (held_out, validation)))
+    standard = Standardised.of(samples.joints[numbers])
+    standard.mean, standard.deviation = standard.mean.to(args.device), standard.deviation.to(args.device)
+    card |= {"samples": len(numbers), "min_coverage": args.min_coverage, "estimated_masks": args.estimated_masks,
+             "estimated_after": args.estimated_after,
+             "mean": standard.mean.tolist(), "deviation": standard.deviation.tolist()}
+    network = Network(paper_joint_layers(args.dilations, args.pool), JOINT_INPUT)
+    network = network.to(args.device, memory_format=torch.channels_last)
+    joints = torch.from_numpy(samples.joints)
+
+    estimated = held_out_estimated = None
+    if args.mask_run:
+        mask_network, state = load_network(args.mask_run)
+        evaluate.shift_logits(mask_network, state["figures"]["logit_shift"])
+        mask_network.to(args.device, memory_format=torch.channels_last)
+        held_out_estimated = evaluate.estimate_masks(mask_network, held_out, validation, args.device)
+        if args.estimated_masks > 0:
+            estimated = evaluate.estimate_masks(mask_network, samples, numbers, args.device, bf16=True)
+    elif args.estimated_masks > 0:
+        raise SystemExit("--estimated-masks needs --mask-run")
+
+    def batch_loss(batch, progress):
+        images, masks = samples.pixels(batch)
+        if estimated is not None and progress >= args.estimated_after:
+            for row in np.flatnonzero(np.random.default_rng(int(torch.randint(2**31, (), device="cpu"))).random(len(batch))
+                                      < args.estimated_masks):
+                masks[row, 0] = torch.from_numpy(estimated[int(batch[row])]).float() / 255
+        images, masks = images.to(args.device), masks.to(args.device)
+        overlays = data.erase_rectangles(data.jitter_colours(images) * masks)
+        overlays, truth = data.rotate_camera(
+            overlays, joints[batch].to(args.device), data.random_rotations(len(batch)))
+        outputs = network(overlays.contiguous(memory_format=torch.channels_last))
+        return losses.joint_loss(standard.metres(outputs), truth)
+
+    def score():
+        figures = evaluate.score_joints(network, standard.metres, held_out, validation, None, args.device, "true_mask")
+        if held_out_estimated is not None:
+            figures |= evaluate.score_joints(
+                network, standard.metres, held_out, validation, held_out_estimated, args.device, "estimated_mask")
+        return figures
+
+    def better(figures):
+        return -figures["true_mask_mean_cm"] - figures.get("estimated_mask_mean_cm", 0)
+
+    fit(args, network, numbers, batch_loss, score, better, card)
