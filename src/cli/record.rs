@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::gpu::{AdapterRequest, Device};
 use crate::recording::{self, Protocol, Request};
 
 /// Renders a synthetic recording of a robot: colour images, exact masks, joints.
@@ -40,8 +41,9 @@ pub struct Args {
 }
 
 fn package(text: &str) -> Result<(String, PathBuf), String> {
-    let (name, folder) =
-        text.split_once('=').ok_or_else(|| format!("expected NAME=DIR, found \"{text}\""))?;
+    let (name, folder) = text
+        .split_once('=')
+        .ok_or_else(|| format!("expected NAME=DIR, found \"{text}\""))?;
     Ok((name.to_owned(), folder.into()))
 }
 
@@ -50,7 +52,11 @@ fn package(text: &str) -> Result<(String, PathBuf), String> {
 /// # Errors
 /// Without a graphics device, and where [`recording::record`] fails.
 pub fn run(args: Args) -> anyhow::Result<()> {
-    let protocol = if args.fixed_camera { Protocol::FixedCamera } else { Protocol::FreeCamera };
+    let protocol = if args.fixed_camera {
+        Protocol::FixedCamera
+    } else {
+        Protocol::FreeCamera
+    };
     let request = Request {
         urdf: args.urdf,
         packages: args.package,
@@ -61,21 +67,13 @@ pub fn run(args: Args) -> anyhow::Result<()> {
         protocol,
         out: args.out,
     };
-    let (device, queue) = pollster::block_on(open_device())?;
+    let device = Device::open(&AdapterRequest::new(None, None))?;
+    log::info!("rendering on {}", device.info().name);
     let bar = ProgressBar::new(request.samples);
     let style = ProgressStyle::with_template("{bar:40} {pos}/{len} samples, {per_sec}, {eta} left")
         .context("the progress bar's template")?;
     bar.set_style(style);
-    recording::record(&device, &queue, &request, |done| bar.set_position(done))?;
+    recording::record(&device, &request, |done| bar.set_position(done))?;
     bar.finish();
     Ok(())
-}
-
-async fn open_device() -> anyhow::Result<(wgpu::Device, wgpu::Queue)> {
-    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
-    let options = wgpu::RequestAdapterOptions::default();
-    let adapter = instance.request_adapter(&options).await.context("no graphics adapter")?;
-    log::info!("{:?}", adapter.get_info());
-    let descriptor = wgpu::DeviceDescriptor::default();
-    adapter.request_device(&descriptor).await.context("the adapter gave no device")
 }

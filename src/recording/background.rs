@@ -32,7 +32,11 @@ impl PhotoView {
             place: [rng.random_range(0.0..1.0), rng.random_range(0.0..1.0)],
             mirrored: rng.random_bool(0.5),
             brightness: rng.random_range(0.7..1.25),
-            blur: if blurred { rng.random_range(0.7..4.0) } else { 0.0 },
+            blur: if blurred {
+                rng.random_range(0.7..4.0)
+            } else {
+                0.0
+            },
         }
     }
 }
@@ -40,6 +44,7 @@ impl PhotoView {
 /// The readable photos of a folder.
 #[derive(Debug)]
 pub struct Backgrounds {
+    folder: PathBuf,
     paths: Vec<PathBuf>,
 }
 
@@ -53,7 +58,10 @@ impl Backgrounds {
         let mut paths = Vec::new();
         for entry in std::fs::read_dir(folder).map_err(RecordingError::io(folder))? {
             let path = entry.map_err(RecordingError::io(folder))?.path();
-            let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
+            let extension = path
+                .extension()
+                .and_then(|e| e.to_str())
+                .map(str::to_ascii_lowercase);
             if matches!(extension.as_deref(), Some("jpg" | "jpeg" | "png")) {
                 paths.push(path);
             }
@@ -72,9 +80,14 @@ impl Backgrounds {
         let mut readable = readable.into_iter();
         paths.retain(|_| readable.next().unwrap_or(false));
         if paths.is_empty() {
-            return Err(RecordingError::NoBackgrounds { path: folder.to_owned() });
+            return Err(RecordingError::NoBackgrounds {
+                path: folder.to_owned(),
+            });
         }
-        Ok(Backgrounds { paths })
+        Ok(Backgrounds {
+            folder: folder.to_owned(),
+            paths,
+        })
     }
 
     /// How many photos there are; at least one.
@@ -85,11 +98,12 @@ impl Backgrounds {
     /// Cuts a view: RGBA, `WIDTH` x `HEIGHT`.
     ///
     /// # Errors
-    /// The photo can no longer be read.
+    /// The photo can no longer be read, or the view was drawn for more photos than there are.
     pub fn view(&self, view: &PhotoView) -> Result<Vec<u8>, RecordingError> {
-        let path = self.paths.get(view.photo).or(self.paths.first());
-        let Some(path) = path else {
-            return Err(RecordingError::NoBackgrounds { path: PathBuf::new() });
+        let Some(path) = self.paths.get(view.photo) else {
+            return Err(RecordingError::NoBackgrounds {
+                path: self.folder.clone(),
+            });
         };
         let mut photo = decode(path)?;
         let aspect = f64::from(WIDTH) / f64::from(HEIGHT);
@@ -107,8 +121,9 @@ impl Backgrounds {
         if view.blur > 0.0 {
             cut = image::imageops::fast_blur(&cut, view.blur);
         }
-        let brighter: Vec<u8> =
-            (0..=255u8).map(|c| (f64::from(c) * view.brightness).min(255.0) as u8).collect();
+        let brighter: Vec<u8> = (0..=255u8)
+            .map(|c| (f64::from(c) * view.brightness).min(255.0) as u8)
+            .collect();
         let bright = |c: u8| brighter.get(usize::from(c)).copied().unwrap_or(c);
         let mut rgba = Vec::with_capacity((4 * WIDTH * HEIGHT) as usize);
         for &[r, g, b] in cut.as_raw().as_chunks::<3>().0 {
@@ -129,7 +144,11 @@ fn resample(photo: &RgbImage, step: f64, place: [f64; 2], mirrored: bool) -> Rgb
             .map(|i| {
                 let at = (start + step * (f64::from(i) + 0.5) - 0.5).clamp(0.0, last);
                 let before = at.floor();
-                (before as usize, (before + 1.0).min(last) as usize, (256.0 * (at - before)) as u32)
+                (
+                    before as usize,
+                    (before + 1.0).min(last) as usize,
+                    (256.0 * (at - before)) as u32,
+                )
             })
             .collect()
     };
@@ -145,8 +164,14 @@ fn resample(photo: &RgbImage, step: f64, place: [f64; 2], mirrored: bool) -> Rgb
     for (out_row, (above, below, down)) in out_rows.zip(taps(HEIGHT, photo.height(), place[1])) {
         let (above, below) = (row(above), row(below));
         for (slot, &(left, right, across)) in out_row.iter_mut().zip(&columns) {
-            let at = |row: &[[u8; 3]], x: usize| row.get(x).copied().unwrap_or_default().map(u32::from);
-            let corners = [at(above, left), at(above, right), at(below, left), at(below, right)];
+            let at =
+                |row: &[[u8; 3]], x: usize| row.get(x).copied().unwrap_or_default().map(u32::from);
+            let corners = [
+                at(above, left),
+                at(above, right),
+                at(below, left),
+                at(below, right),
+            ];
             let weights = [
                 (256 - across) * (256 - down),
                 across * (256 - down),
@@ -154,7 +179,11 @@ fn resample(photo: &RgbImage, step: f64, place: [f64; 2], mirrored: bool) -> Rgb
                 across * down,
             ];
             for (channel, value) in slot.iter_mut().enumerate() {
-                let sum: u32 = corners.iter().zip(weights).map(|(c, w)| c[channel] * w).sum();
+                let sum: u32 = corners
+                    .iter()
+                    .zip(weights)
+                    .map(|(c, w)| c[channel] * w)
+                    .sum();
                 *value = ((sum + (1 << 15)) >> 16) as u8;
             }
         }
@@ -167,5 +196,10 @@ fn decode(path: &Path) -> Result<RgbImage, RecordingError> {
         .and_then(image::ImageReader::with_guessed_format)
         .map_err(RecordingError::io(path))?
         .decode();
-    Ok(picture.map_err(|source| RecordingError::Picture { path: path.to_owned(), source })?.into_rgb8())
+    Ok(picture
+        .map_err(|source| RecordingError::Picture {
+            path: path.to_owned(),
+            source,
+        })?
+        .into_rgb8())
 }

@@ -35,8 +35,9 @@ impl CollisionModel {
                     .collect()
             })
             .collect();
-        let solid: Vec<usize> =
-            (0..shapes.len()).filter(|&i| shapes.get(i).is_some_and(|s| !s.is_empty())).collect();
+        let solid: Vec<usize> = (0..shapes.len())
+            .filter(|&i| shapes.get(i).is_some_and(|s| !s.is_empty()))
+            .collect();
         let parent = |link: usize| robot.links.get(link).and_then(|l| l.parent);
         let mut pairs: Vec<(usize, usize)> = Vec::new();
         for (n, &a) in solid.iter().enumerate() {
@@ -48,17 +49,27 @@ impl CollisionModel {
         }
         let base = robot.base_link();
         let above_floor = solid.into_iter().filter(|&link| link != base).collect();
-        let mut model = CollisionModel { shapes, pairs: Vec::new(), above_floor };
+        let mut model = CollisionModel {
+            shapes,
+            pairs: Vec::new(),
+            above_floor,
+        };
         let mut rng = ChaCha8Rng::seed_from_u64(0);
         let probes: Vec<Vec<DAffine3>> = (0..PROBES)
             .map(|_| {
-                let angles: Vec<f64> =
-                    robot.joints.iter().map(|j| rng.random_range(j.range[0]..=j.range[1])).collect();
+                let angles: Vec<f64> = robot
+                    .joints
+                    .iter()
+                    .map(|j| rng.random_range(j.range[0]..=j.range[1]))
+                    .collect();
                 robot.link_poses(&angles)
             })
             .collect();
         pairs.retain(|&(a, b)| {
-            let touching = probes.iter().filter(|poses| model.touch(a, b, poses)).count();
+            let touching = probes
+                .iter()
+                .filter(|poses| model.touch(a, b, poses))
+                .count();
             touching * 10 < PROBES * 9
         });
         model.pairs = pairs;
@@ -67,13 +78,17 @@ impl CollisionModel {
 
     /// Whether two links that should not touch do.
     pub fn self_collision(&self, link_poses: &[DAffine3]) -> bool {
-        self.pairs.iter().any(|&(a, b)| self.touch(a, b, link_poses))
+        self.pairs
+            .iter()
+            .any(|&(a, b)| self.touch(a, b, link_poses))
     }
 
     /// Whether any link but the base reaches below the plane z = `floor` of the base frame.
     pub fn floor_collision(&self, link_poses: &[DAffine3], floor: f64) -> bool {
         self.above_floor.iter().any(|&link| {
-            let Some(pose) = link_poses.get(link) else { return false };
+            let Some(pose) = link_poses.get(link) else {
+                return false;
+            };
             let up = pose.matrix3.transpose().z_axis.as_vec3();
             let height = pose.translation.z as f32;
             let shapes = self.shapes.get(link).into_iter().flatten();

@@ -32,10 +32,26 @@ impl Effects {
         Effects {
             gain: [(); 3].map(|()| exposure * rng.random_range(0.92..1.08f32)),
             gamma: rng.random_range(0.8..1.25),
-            lift: if rng.random_bool(0.3) { rng.random_range(0.0..0.08) } else { 0.0 },
-            blur: if rng.random_bool(0.35) { rng.random_range(0.4..1.4) } else { 0.0 },
-            vignette: if rng.random_bool(0.4) { rng.random_range(0.0..0.35) } else { 0.0 },
-            noise: if rng.random_bool(0.7) { rng.random_range(0.5..9.0) } else { 0.0 },
+            lift: if rng.random_bool(0.3) {
+                rng.random_range(0.0..0.08)
+            } else {
+                0.0
+            },
+            blur: if rng.random_bool(0.35) {
+                rng.random_range(0.4..1.4)
+            } else {
+                0.0
+            },
+            vignette: if rng.random_bool(0.4) {
+                rng.random_range(0.0..0.35)
+            } else {
+                0.0
+            },
+            noise: if rng.random_bool(0.7) {
+                rng.random_range(0.5..9.0)
+            } else {
+                0.0
+            },
             grey: rng.random_bool(0.03),
             seed: rng.next_u64(),
         }
@@ -62,7 +78,10 @@ impl Effects {
         let (half_width, half_height) = (0.5 * WIDTH as f32, 0.5 * HEIGHT as f32);
         for (i, pixel) in rgb.as_chunks_mut::<3>().0.iter_mut().enumerate() {
             let i = i as u32;
-            let (x, y) = ((i % WIDTH) as f32 / half_width - 1.0, (i / WIDTH) as f32 / half_height - 1.0);
+            let (x, y) = (
+                (i % WIDTH) as f32 / half_width - 1.0,
+                (i / WIDTH) as f32 / half_height - 1.0,
+            );
             let light = 1.0 - 0.5 * self.vignette * (x * x + y * y);
             let mut values = [0.0; 3];
             for ((value, curve), &channel) in values.iter_mut().zip(&curves).zip(pixel.iter()) {
@@ -73,7 +92,12 @@ impl Effects {
             }
             if self.noise > 0.0 {
                 for value in &mut values {
-                    let sum: u32 = noise.next_u32().to_le_bytes().iter().map(|&b| u32::from(b)).sum();
+                    let sum: u32 = noise
+                        .next_u32()
+                        .to_le_bytes()
+                        .iter()
+                        .map(|&b| u32::from(b))
+                        .sum();
                     *value += strength * (sum as f32 - 510.0);
                 }
             }

@@ -1,5 +1,7 @@
 use std::path::PathBuf;
 
+use crate::gpu::GpuError;
+
 /// Why a recording could not be made, read or continued.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -68,9 +70,9 @@ pub enum RecordingError {
         /// The sample's number.
         id: u64,
     },
-    /// The graphics device could not draw.
-    #[error("rendering: {0}")]
-    Render(String),
+    /// The GPU could not draw.
+    #[error(transparent)]
+    Gpu(#[from] GpuError),
 }
 
 impl RecordingError {

@@ -114,14 +114,18 @@ impl Writer {
             std::fs::create_dir_all(&inside).map_err(RecordingError::io(&inside))?;
         }
         if header_path.exists() {
-            let text = std::fs::read_to_string(&header_path).map_err(RecordingError::io(&header_path))?;
+            let text =
+                std::fs::read_to_string(&header_path).map_err(RecordingError::io(&header_path))?;
             let found = serde_json::from_str::<Header>(&text);
             if !found.is_ok_and(|found| found == *header) {
                 let message = "holds a recording of another request: choose another folder";
                 return Err(taken(&header_path, message));
             }
         } else if lines_path.exists() {
-            return Err(taken(&lines_path, "samples without a recording.json: choose another folder"));
+            return Err(taken(
+                &lines_path,
+                "samples without a recording.json: choose another folder",
+            ));
         } else {
             let text = serde_json::to_string_pretty(header).map_err(|e| RecordingError::Io {
                 path: header_path.clone(),
@@ -140,19 +144,34 @@ impl Writer {
         let mut complete = 0;
         let mut reader = BufReader::new(&mut lines);
         let mut line = String::new();
-        while reader.read_line(&mut line).map_err(RecordingError::io(&lines_path))? > 0 {
+        while reader
+            .read_line(&mut line)
+            .map_err(RecordingError::io(&lines_path))?
+            > 0
+        {
             if !line.ends_with('\n') {
                 break;
             }
             match serde_json::from_str::<Sample>(&line) {
                 Ok(sample) if sample.id == next => next += 1,
-                _ => return Err(taken(&lines_path, &format!("line {} is not sample {next}", next + 1))),
+                _ => {
+                    return Err(taken(
+                        &lines_path,
+                        &format!("line {} is not sample {next}", next + 1),
+                    ));
+                }
             }
             complete += line.len() as u64;
             line.clear();
         }
-        lines.set_len(complete).map_err(RecordingError::io(&lines_path))?;
-        Ok(Writer { folder: folder.to_owned(), lines, next })
+        lines
+            .set_len(complete)
+            .map_err(RecordingError::io(&lines_path))?;
+        Ok(Writer {
+            folder: folder.to_owned(),
+            lines,
+            next,
+        })
     }
 
     /// The number of the sample to write next.
@@ -171,10 +190,14 @@ impl Writer {
     /// The line cannot be written.
     pub fn append(&mut self, sample: &Sample) -> Result<(), RecordingError> {
         let path = || self.folder.join("samples.jsonl");
-        let mut line = serde_json::to_string(sample)
-            .map_err(|e| RecordingError::Io { path: path(), source: e.into() })?;
+        let mut line = serde_json::to_string(sample).map_err(|e| RecordingError::Io {
+            path: path(),
+            source: e.into(),
+        })?;
         line.push('\n');
-        self.lines.write_all(line.as_bytes()).map_err(RecordingError::io(path()))?;
+        self.lines
+            .write_all(line.as_bytes())
+            .map_err(RecordingError::io(path()))?;
         self.next += 1;
         Ok(())
     }
@@ -184,7 +207,11 @@ impl Writer {
 ///
 /// # Errors
 /// A file cannot be written.
-pub fn write_picture(folder: &Path, sample: &Sample, picture: &Picture) -> Result<(), RecordingError> {
+pub fn write_picture(
+    folder: &Path,
+    sample: &Sample,
+    picture: &Picture,
+) -> Result<(), RecordingError> {
     let mut jpeg = Vec::new();
     let image_path = folder.join(&sample.image);
     let mask_path = folder.join(&sample.mask);

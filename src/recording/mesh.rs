@@ -29,11 +29,28 @@ impl Mesh {
     /// The file cannot be read, is of another kind, or breaks its format's rules.
     pub fn read(path: &Path) -> Result<Vec<Mesh>, RecordingError> {
         let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("");
-        match extension.to_ascii_lowercase().as_str() {
-            "dae" => read_collada(path),
-            "stl" | "obj" => read_with_mesh_loader(path),
-            other => Err(broken(path, format!("expected a .dae, .stl or .obj mesh, found .{other}"))),
+        let meshes = match extension.to_ascii_lowercase().as_str() {
+            "dae" => read_collada(path)?,
+            "stl" | "obj" => read_with_mesh_loader(path)?,
+            other => {
+                let message = format!("expected a .dae, .stl or .obj mesh, found .{other}");
+                return Err(broken(path, message));
+            }
+        };
+        if meshes.iter().all(|mesh| mesh.indices.is_empty()) {
+            return Err(broken(path, "expected triangles, found none"));
         }
+        for mesh in &meshes {
+            let count = mesh.positions.len();
+            if let Some(index) = mesh.indices.iter().find(|&&i| i as usize >= count) {
+                let message = format!("a triangle wants vertex {index}, but there are {count}");
+                return Err(broken(path, message));
+            }
+            if !mesh.positions.as_flattened().iter().all(|c| c.is_finite()) {
+                return Err(broken(path, "expected finite coordinates, found others"));
+            }
+        }
+        Ok(meshes)
     }
 
     /// A cube with edges of length 1 about the origin.
@@ -82,7 +99,8 @@ impl Mesh {
                 mesh.positions.push([0.5 * cos, 0.5 * sin, 0.5 * z]);
                 mesh.normals.push([0.0, 0.0, z]);
                 if i < SIDES {
-                    mesh.indices.extend([centre, centre + 1 + i, centre + 2 + i]);
+                    mesh.indices
+                        .extend([centre, centre + 1 + i, centre + 2 + i]);
                 }
             }
         }
@@ -126,11 +144,16 @@ impl Mesh {
 }
 
 fn broken(path: &Path, message: impl Into<String>) -> RecordingError {
-    RecordingError::Mesh { path: path.to_owned(), message: message.into() }
+    RecordingError::Mesh {
+        path: path.to_owned(),
+        message: message.into(),
+    }
 }
 
 fn read_with_mesh_loader(path: &Path) -> Result<Vec<Mesh>, RecordingError> {
-    let scene = mesh_loader::Loader::default().load(path).map_err(RecordingError::io(path))?;
+    let scene = mesh_loader::Loader::default()
+        .load(path)
+        .map_err(RecordingError::io(path))?;
     let meshes = scene.meshes.iter().zip(&scene.materials);
     Ok(meshes
         .filter(|(mesh, _)| !mesh.faces.is_empty())
@@ -144,9 +167,10 @@ fn read_with_mesh_loader(path: &Path) -> Result<Vec<Mesh>, RecordingError> {
                     diffuse,
                 }
             } else {
-                let triangles = mesh.faces.iter().map(|f| {
-                    f.map(|i| mesh.vertices.get(i as usize).copied().unwrap_or_default())
-                });
+                let triangles = mesh
+                    .faces
+                    .iter()
+                    .map(|f| f.map(|i| mesh.vertices.get(i as usize).copied().unwrap_or_default()));
                 flat_shaded(triangles, diffuse)
             }
         })
@@ -155,7 +179,10 @@ fn read_with_mesh_loader(path: &Path) -> Result<Vec<Mesh>, RecordingError> {
 
 /// Triangles with the normal of their own plane at each corner.
 fn flat_shaded(triangles: impl Iterator<Item = [[f32; 3]; 3]>, diffuse: Option<[f32; 3]>) -> Mesh {
-    let mut mesh = Mesh { diffuse, ..Mesh::default() };
+    let mut mesh = Mesh {
+        diffuse,
+        ..Mesh::default()
+    };
     for corners in triangles {
         let [a, b, c] = corners.map(Vec3::from);
         let normal = (b - a).cross(c - a).normalize_or_zero().into();
@@ -175,7 +202,7 @@ fn child<'a>(node: Element<'a>, name: &'a str) -> Option<Element<'a>> {
 }
 
 fn children<'a>(node: Element<'a>, name: &'a str) -> impl Iterator<Item = Element<'a>> {
-    node.children().filter(move |n| n.has_tag_name(name) || n.tag_name().name() == name)
+    node.children().filter(move |n| n.tag_name().name() == name)
 }
 
 fn descendant<'a>(node: Element<'a>, name: &str) -> Option<Element<'a>> {
@@ -183,7 +210,11 @@ fn descendant<'a>(node: Element<'a>, name: &str) -> Option<Element<'a>> {
 }
 
 fn numbers<T: std::str::FromStr>(node: Element<'_>) -> Option<Vec<T>> {
-    node.text().unwrap_or("").split_ascii_whitespace().map(|t| t.parse().ok()).collect()
+    node.text()
+        .unwrap_or("")
+        .split_ascii_whitespace()
+        .map(|t| t.parse().ok())
+        .collect()
 }
 
 /// A COLLADA file: `triangles` and `polylist` primitives with positions and normals, placed by the
@@ -192,8 +223,10 @@ fn read_collada(path: &Path) -> Result<Vec<Mesh>, RecordingError> {
     let text = std::fs::read_to_string(path).map_err(RecordingError::io(path))?;
     let document = Document::parse(&text).map_err(|e| broken(path, format!("not XML: {e}")))?;
     let root = document.root_element();
-    let by_id: HashMap<&str, Element<'_>> =
-        root.descendants().filter_map(|n| Some((n.attribute("id")?, n))).collect();
+    let by_id: HashMap<&str, Element<'_>> = root
+        .descendants()
+        .filter_map(|n| Some((n.attribute("id")?, n)))
+        .collect();
     let unit = descendant(root, "unit")
         .and_then(|n| n.attribute("meter"))
         .map_or(Some(1.0), |t| t.parse::<f32>().ok())
@@ -204,9 +237,6 @@ fn read_collada(path: &Path) -> Result<Vec<Mesh>, RecordingError> {
     let mut meshes = Vec::new();
     for node in children(scene, "node") {
         reader.node(node, Affine3A::from_scale(Vec3::splat(unit)), &mut meshes)?;
-    }
-    if meshes.is_empty() {
-        return Err(broken(path, "expected triangles, found none"));
     }
     Ok(meshes)
 }
@@ -247,7 +277,9 @@ impl<'a> Collada<'a> {
                     ("matrix", Some(m)) if m.len() == 16 => {
                         Affine3A::from_mat4(Mat4::from_cols_slice(m).transpose())
                     }
-                    ("translate", Some(&[x, y, z])) => Affine3A::from_translation(Vec3::new(x, y, z)),
+                    ("translate", Some(&[x, y, z])) => {
+                        Affine3A::from_translation(Vec3::new(x, y, z))
+                    }
                     ("scale", Some(&[x, y, z])) => Affine3A::from_scale(Vec3::new(x, y, z)),
                     ("rotate", Some(&[x, y, z, degrees])) => {
                         let axis = Vec3::new(x, y, z).normalize_or(Vec3::Z);
@@ -271,7 +303,9 @@ impl<'a> Collada<'a> {
         geometry: Element<'a>,
         instance: Element<'a>,
     ) -> Result<Vec<Mesh>, RecordingError> {
-        let Some(mesh) = child(geometry, "mesh") else { return Ok(Vec::new()) };
+        let Some(mesh) = child(geometry, "mesh") else {
+            return Ok(Vec::new());
+        };
         mesh.children()
             .filter(|n| matches!(n.tag_name().name(), "triangles" | "polylist"))
             .map(|primitive| {
@@ -292,7 +326,9 @@ impl<'a> Collada<'a> {
             .and_then(|n| n.attribute("target"))
             .unwrap_or(symbol);
         let material = self.follow(Some(bound)).ok()?;
-        let effect = self.follow(child(material, "instance_effect")?.attribute("url")).ok()?;
+        let effect = self
+            .follow(child(material, "instance_effect")?.attribute("url"))
+            .ok()?;
         let colour = child(descendant(effect, "diffuse")?, "color")?;
         match numbers::<f32>(colour)?.as_slice() {
             &[r, g, b, ..] => Some([r, g, b]),
@@ -312,7 +348,11 @@ impl<'a> Collada<'a> {
         let mut positions = None;
         let mut normals = None;
         for input in children(primitive, "input") {
-            let offset: usize = input.attribute("offset").and_then(|o| o.parse().ok()).unwrap_or(0);
+            let offset: u16 = input
+                .attribute("offset")
+                .and_then(|o| o.parse().ok())
+                .unwrap_or(0);
+            let offset = usize::from(offset);
             stride = stride.max(offset + 1);
             let source = self.follow(input.attribute("source"))?;
             match input.attribute("semantic") {
@@ -343,10 +383,10 @@ impl<'a> Collada<'a> {
             None => vec![3; corners.len() / 3],
         };
         let mut triangles = Vec::new();
-        let mut start = 0;
+        let mut start = 0usize;
         for count in polygons {
             let polygon = corners
-                .get(start..start + count)
+                .get(start..start.saturating_add(count))
                 .ok_or_else(|| self.error("fewer indices than the polygons need"))?;
             for pair in polygon.get(1..).unwrap_or_default().windows(2) {
                 triangles.push([polygon[0], pair[0], pair[1]]);
@@ -362,7 +402,7 @@ impl<'a> Collada<'a> {
                 .ok_or_else(|| self.error(format!("index {index} beyond the positions")))
         };
         let Some((normal_at, normals)) = normals else {
-            let corners: Result<Vec<[[f32; 3]; 3]>, _> = triangles
+            let corners: Result<Vec<[[f32; 3]; 3]>, RecordingError> = triangles
                 .iter()
                 .map(|t| Ok([position(t[0])?, position(t[1])?, position(t[2])?]))
                 .collect();
@@ -372,7 +412,10 @@ impl<'a> Collada<'a> {
         let mut seen: HashMap<(u32, u32), u32> = HashMap::new();
         for &corner in triangles.iter().flatten() {
             let normal_index = corner.get(normal_at).copied().unwrap_or(u32::MAX);
-            let key = (corner.get(position_at).copied().unwrap_or(u32::MAX), normal_index);
+            let key = (
+                corner.get(position_at).copied().unwrap_or(u32::MAX),
+                normal_index,
+            );
             let index = match seen.get(&key) {
                 Some(&index) => index,
                 None => {

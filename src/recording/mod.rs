@@ -4,14 +4,17 @@
 //! base frame (the frame of the first joint's parent link, z up), as each name says.
 
 mod background;
+mod chance;
 mod collision;
 mod effects;
 mod error;
 mod format;
 mod mesh;
+mod props;
 mod render;
 mod robot;
 mod scene;
+mod stage;
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -26,16 +29,23 @@ pub use format::{Header, Protocol, Sample, Source, Writer, write_picture};
 pub use mesh::Mesh;
 pub use render::{Picture, Renderer};
 pub use robot::{Joint, Link, Robot};
-pub use scene::{Item, Kind, Lamp, Lighting, Material, Posed, Scene, Stage, Station};
+pub use scene::{Item, Kind, Lamp, Lighting, Material, Scene};
+pub use stage::{Posed, Shot, Stage, Station};
 
 use crate::camera::Intrinsics;
+use crate::gpu::Device;
 
 /// Width of recorded images, pixels.
 pub const WIDTH: u32 = 512;
 /// Height of recorded images, pixels.
 pub const HEIGHT: u32 = 424;
 /// The recorder's camera: that of the Kinect V2's depth image.
-pub const INTRINSICS: Intrinsics = Intrinsics { fx: 365.0, fy: 365.0, cx: 255.5, cy: 211.5 };
+pub const INTRINSICS: Intrinsics = Intrinsics {
+    fx: 365.0,
+    fy: 365.0,
+    cx: 255.5,
+    cy: 211.5,
+};
 
 /// What to record.
 #[derive(Debug, Clone)]
@@ -64,8 +74,7 @@ pub struct Request {
 /// The request cannot be carried out, the device fails or a file cannot be written. Samples written so
 /// far stay.
 pub fn record(
-    device: &wgpu::Device,
-    queue: &wgpu::Queue,
+    device: &Device,
     request: &Request,
     progress: impl Fn(u64),
 ) -> Result<(), RecordingError> {
@@ -75,7 +84,12 @@ pub fn record(
         format: "whereabot-recording".into(),
         version: 1,
         robot: request.robot.clone(),
-        joints: stage.robot().joints.iter().map(|j| j.name.clone()).collect(),
+        joints: stage
+            .robot()
+            .joints
+            .iter()
+            .map(|j| j.name.clone())
+            .collect(),
         width: WIDTH,
         height: HEIGHT,
         frame: "camera_optical".into(),
@@ -95,24 +109,28 @@ pub fn record(
         Protocol::FixedCamera => Some(stage.station(request.seed)?),
         Protocol::FreeCamera => None,
     };
-    let renderer = Mutex::new(Renderer::new(device, queue, stage.meshes())?);
+    let renderer = Mutex::new(Renderer::new(device, stage.meshes())?);
     let mut writer = Writer::open(&request.out, &header)?;
     let folder = writer.folder().to_owned();
     progress(writer.next());
 
     let make = |id: u64| -> Result<Sample, RecordingError> {
-        let scene = match &station {
-            Some(station) => stage.fixed_scene(station, id, backgrounds.count())?,
-            None => stage.free_scene(request.seed, id, backgrounds.count())?,
+        let shot = match &station {
+            Some(station) => stage.fixed_shot(station, id, backgrounds.count())?,
+            None => stage.free_shot(request.seed, id, backgrounds.count())?,
         };
-        let background = backgrounds.view(&scene.background)?;
-        let texture = scene.texture.as_ref().map(|view| backgrounds.view(view)).transpose()?;
+        let background = backgrounds.view(&shot.background)?;
+        let texture = shot
+            .texture
+            .as_ref()
+            .map(|view| backgrounds.view(view))
+            .transpose()?;
         let mut picture = renderer
             .lock()
             .unwrap_or_else(std::sync::PoisonError::into_inner)
-            .draw(&scene, &background, texture.as_deref())?;
-        scene.effects.apply(&mut picture.rgb);
-        let sample = describe(id, &scene, &picture);
+            .draw(&shot.scene, &background, texture.as_deref())?;
+        shot.effects.apply(&mut picture.rgb);
+        let sample = describe(id, &shot, &picture);
         write_picture(&folder, &sample, &picture)?;
         Ok(sample)
     };
@@ -153,10 +171,12 @@ pub fn record(
     })
 }
 
-fn describe(id: u64, scene: &Scene, picture: &Picture) -> Sample {
+fn describe(id: u64, shot: &Shot, picture: &Picture) -> Sample {
     let covered = picture.mask.iter().filter(|&&m| m > 0).count();
-    let matrix = glam::DMat4::from(scene.camera_from_base).transpose().to_cols_array();
-    let robot = scene.robot.as_ref();
+    let matrix = glam::DMat4::from(shot.scene.camera_from_base)
+        .transpose()
+        .to_cols_array();
+    let robot = shot.robot.as_ref();
     Sample {
         id,
         image: format!("image/{id:06}.jpg"),
@@ -166,7 +186,10 @@ fn describe(id: u64, scene: &Scene, picture: &Picture) -> Sample {
         joint_angles_rad: robot.map(|r| r.angles.clone()),
         joints_m: robot.map(|r| r.joints.iter().map(|j| j.to_array()).collect()),
         joints_px: robot.map(|r| {
-            r.joints.iter().filter_map(|j| INTRINSICS.project(j.to_array())).collect()
+            r.joints
+                .iter()
+                .filter_map(|j| INTRINSICS.project(j.to_array()))
+                .collect()
         }),
         coverage: covered as f64 / picture.mask.len() as f64,
     }

@@ -1,15 +1,13 @@
 //! Draws scenes with wgpu: a colour picture and where the robot is visible in it.
 
-use std::sync::mpsc;
-use std::time::Duration;
-
 use bytemuck::{Pod, Zeroable};
 use glam::{DAffine3, DVec3, Mat4, Vec3, Vec4};
 use wgpu::util::DeviceExt;
 
 use super::mesh::Mesh;
-use super::scene::{Kind, Scene};
+use super::scene::{Item, Kind, Scene};
 use super::{HEIGHT, INTRINSICS, RecordingError, WIDTH};
+use crate::gpu::{Device, GpuError};
 
 const SAMPLES: u32 = 4;
 const COLOUR: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
@@ -21,7 +19,6 @@ const SHADOW_REACH: f32 = 1.5;
 /// Nearest and farthest distance drawn, metres.
 const NEAR: f64 = 0.05;
 const FAR: f64 = 30.0;
-const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// What the camera sees of a scene: `WIDTH` x `HEIGHT` pixels, row by row from the top left.
 pub struct Picture {
@@ -70,9 +67,8 @@ struct Range {
 }
 
 /// Draws scenes made of a fixed set of meshes.
-pub struct Renderer {
-    device: wgpu::Device,
-    queue: wgpu::Queue,
+pub struct Renderer<'a> {
+    device: &'a Device,
     ranges: Vec<Range>,
     vertices: wgpu::Buffer,
     indices: wgpu::Buffer,
@@ -98,25 +94,17 @@ struct Target {
     resolved_view: wgpu::TextureView,
 }
 
-impl Renderer {
+impl<'a> Renderer<'a> {
     /// Makes pipelines and buffers for scenes whose items refer to `meshes` by their position.
     ///
     /// # Errors
     /// The device rejects a pipeline or a buffer.
-    pub fn new(
-        device: &wgpu::Device,
-        queue: &wgpu::Queue,
-        meshes: &[Mesh],
-    ) -> Result<Renderer, RecordingError> {
-        let scope = device.push_error_scope(wgpu::ErrorFilter::Validation);
-        let renderer = Self::build(device, queue, meshes);
-        match pollster::block_on(scope.pop()) {
-            Some(error) => Err(RecordingError::Render(error.to_string())),
-            None => Ok(renderer),
-        }
+    pub fn new(device: &'a Device, meshes: &[Mesh]) -> Result<Renderer<'a>, RecordingError> {
+        Ok(device.scoped(|| Ok(Self::build(device, meshes)))?)
     }
 
-    fn build(device: &wgpu::Device, queue: &wgpu::Queue, meshes: &[Mesh]) -> Renderer {
+    fn build(owner: &'a Device, meshes: &[Mesh]) -> Renderer<'a> {
+        let device = owner.wgpu();
         let mut vertices = Vec::new();
         let mut indices: Vec<u32> = Vec::new();
         let mut ranges = Vec::new();
@@ -131,7 +119,11 @@ impl Renderer {
             vertices.extend(pairs.map(|(&position, &normal)| Vertex { position, normal }));
         }
         let fixed = |label, contents: &[u8], usage| {
-            device.create_buffer_init(&wgpu::util::BufferInitDescriptor { label: Some(label), contents, usage })
+            device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+                label: Some(label),
+                contents,
+                usage,
+            })
         };
         let buffer = |label, size: usize, usage| {
             device.create_buffer(&wgpu::BufferDescriptor {
@@ -141,10 +133,16 @@ impl Renderer {
                 mapped_at_creation: false,
             })
         };
-        let vertices =
-            fixed("meshes' vertices", bytemuck::cast_slice(&vertices), wgpu::BufferUsages::VERTEX);
-        let indices =
-            fixed("meshes' indices", bytemuck::cast_slice(&indices), wgpu::BufferUsages::INDEX);
+        let vertices = fixed(
+            "meshes' vertices",
+            bytemuck::cast_slice(&vertices),
+            wgpu::BufferUsages::VERTEX,
+        );
+        let indices = fixed(
+            "meshes' indices",
+            bytemuck::cast_slice(&indices),
+            wgpu::BufferUsages::INDEX,
+        );
         let instances = buffer(
             "items",
             ITEMS * size_of::<Instance>(),
@@ -165,7 +163,11 @@ impl Renderer {
         let texture = |label, width, height, layers, samples, format, usage| {
             device.create_texture(&wgpu::TextureDescriptor {
                 label: Some(label),
-                size: wgpu::Extent3d { width, height, depth_or_array_layers: layers },
+                size: wgpu::Extent3d {
+                    width,
+                    height,
+                    depth_or_array_layers: layers,
+                },
                 mip_level_count: 1,
                 sample_count: samples,
                 dimension: wgpu::TextureDimension::D2,
@@ -176,11 +178,26 @@ impl Renderer {
         };
         let attachment = wgpu::TextureUsages::RENDER_ATTACHMENT;
         let target = |format| {
-            let resolved =
-                texture("resolved", WIDTH, HEIGHT, 1, 1, format, attachment | wgpu::TextureUsages::COPY_SRC);
+            let resolved = texture(
+                "resolved",
+                WIDTH,
+                HEIGHT,
+                1,
+                1,
+                format,
+                attachment | wgpu::TextureUsages::COPY_SRC,
+            );
             Target {
-                multisampled: texture("multisampled", WIDTH, HEIGHT, 1, SAMPLES, format, attachment)
-                    .create_view(&Default::default()),
+                multisampled: texture(
+                    "multisampled",
+                    WIDTH,
+                    HEIGHT,
+                    1,
+                    SAMPLES,
+                    format,
+                    attachment,
+                )
+                .create_view(&Default::default()),
                 resolved_view: resolved.create_view(&Default::default()),
                 resolved,
             }
@@ -190,10 +207,25 @@ impl Renderer {
         let depth = texture("depth", WIDTH, HEIGHT, 1, SAMPLES, DEPTH, attachment)
             .create_view(&Default::default());
         let sampled = wgpu::TextureUsages::TEXTURE_BINDING;
-        let shadow = texture("shadow map", SHADOW_EDGE, SHADOW_EDGE, 1, 1, DEPTH, attachment | sampled)
-            .create_view(&Default::default());
-        let photos =
-            texture("photos", WIDTH, HEIGHT, 2, 1, COLOUR, sampled | wgpu::TextureUsages::COPY_DST);
+        let shadow = texture(
+            "shadow map",
+            SHADOW_EDGE,
+            SHADOW_EDGE,
+            1,
+            1,
+            DEPTH,
+            attachment | sampled,
+        )
+        .create_view(&Default::default());
+        let photos = texture(
+            "photos",
+            WIDTH,
+            HEIGHT,
+            2,
+            1,
+            COLOUR,
+            sampled | wgpu::TextureUsages::COPY_DST,
+        );
         let photos_view = photos.create_view(&wgpu::TextureViewDescriptor {
             dimension: Some(wgpu::TextureViewDimension::D2Array),
             ..Default::default()
@@ -214,7 +246,12 @@ impl Renderer {
             ..Default::default()
         });
 
-        let entry = |binding, visibility, ty| wgpu::BindGroupLayoutEntry { binding, visibility, ty, count: None };
+        let entry = |binding, visibility, ty| wgpu::BindGroupLayoutEntry {
+            binding,
+            visibility,
+            ty,
+            count: None,
+        };
         let uniform = wgpu::BindingType::Buffer {
             ty: wgpu::BufferBindingType::Uniform,
             has_dynamic_offset: false,
@@ -242,9 +279,24 @@ impl Renderer {
                         wgpu::TextureViewDimension::D2Array,
                     ),
                 ),
-                entry(2, fragment, wgpu::BindingType::Sampler(wgpu::SamplerBindingType::Filtering)),
-                entry(3, fragment, sampled(wgpu::TextureSampleType::Depth, wgpu::TextureViewDimension::D2)),
-                entry(4, fragment, wgpu::BindingType::Sampler(wgpu::SamplerBindingType::Comparison)),
+                entry(
+                    2,
+                    fragment,
+                    wgpu::BindingType::Sampler(wgpu::SamplerBindingType::Filtering),
+                ),
+                entry(
+                    3,
+                    fragment,
+                    sampled(
+                        wgpu::TextureSampleType::Depth,
+                        wgpu::TextureViewDimension::D2,
+                    ),
+                ),
+                entry(
+                    4,
+                    fragment,
+                    wgpu::BindingType::Sampler(wgpu::SamplerBindingType::Comparison),
+                ),
             ],
         });
         let bound = |binding, resource| wgpu::BindGroupEntry { binding, resource };
@@ -265,9 +317,11 @@ impl Renderer {
             ],
         });
 
-        let shader =
-            device.create_shader_module(wgpu::include_wgsl!("../../shaders/render.wgsl"));
-        let pipelines = Pipelines { device, shader: &shader };
+        let shader = device.create_shader_module(wgpu::include_wgsl!("../../shaders/render.wgsl"));
+        let pipelines = Pipelines {
+            device,
+            shader: &shader,
+        };
         let all = wgpu::ColorWrites::ALL;
         let none = wgpu::ColorWrites::empty();
         Renderer {
@@ -275,8 +329,7 @@ impl Renderer {
             object_pipeline: pipelines.scene(&scene_layout, "object", true, all),
             overlay_pipeline: pipelines.scene(&scene_layout, "object", true, none),
             shadow_pipeline: pipelines.shadow(&shadow_layout),
-            device: device.clone(),
-            queue: queue.clone(),
+            device: owner,
             ranges,
             vertices,
             indices,
@@ -297,24 +350,38 @@ impl Renderer {
     /// everything, and what textured surfaces show.
     ///
     /// # Errors
-    /// The scene has more items than fit, or the device fails or does not answer in time.
+    /// The scene has more items than fit, a photo has another size, or the device fails or does not
+    /// answer in time.
     pub fn draw(
         &mut self,
         scene: &Scene,
         background: &[u8],
         texture: Option<&[u8]>,
     ) -> Result<Picture, RecordingError> {
-        let fail = |message: String| RecordingError::Render(message);
-        if scene.items.len() > ITEMS {
-            return Err(fail(format!("expected at most {ITEMS} items, found {}", scene.items.len())));
-        }
+        let (device, queue) = (self.device.wgpu(), self.device.queue());
+        self.device
+            .require("items in a scene", scene.items.len() as u64, ITEMS as u64)?;
         for (layer, photo) in [Some(background), texture].into_iter().enumerate() {
             let Some(photo) = photo else { continue };
-            self.queue.write_texture(
+            let expected = (4 * WIDTH * HEIGHT) as usize;
+            if photo.len() != expected {
+                let found = photo.len();
+                return Err(GpuError::Size {
+                    what: "photo",
+                    expected,
+                    found,
+                }
+                .into());
+            }
+            queue.write_texture(
                 wgpu::TexelCopyTextureInfo {
                     texture: &self.photos,
                     mip_level: 0,
-                    origin: wgpu::Origin3d { x: 0, y: 0, z: layer as u32 },
+                    origin: wgpu::Origin3d {
+                        x: 0,
+                        y: 0,
+                        z: layer as u32,
+                    },
                     aspect: wgpu::TextureAspect::All,
                 },
                 photo,
@@ -323,19 +390,29 @@ impl Renderer {
                     bytes_per_row: Some(4 * WIDTH),
                     rows_per_image: Some(HEIGHT),
                 },
-                wgpu::Extent3d { width: WIDTH, height: HEIGHT, depth_or_array_layers: 1 },
+                wgpu::Extent3d {
+                    width: WIDTH,
+                    height: HEIGHT,
+                    depth_or_array_layers: 1,
+                },
             );
         }
-        self.queue.write_buffer(&self.view, 0, bytemuck::bytes_of(&view(scene)));
-        let instances: Vec<Instance> =
-            scene.items.iter().map(|item| instance(scene.camera_from_base, item)).collect();
-        self.queue.write_buffer(&self.instances, 0, bytemuck::cast_slice(&instances));
+        queue.write_buffer(&self.view, 0, bytemuck::bytes_of(&view(scene)));
+        let instances: Vec<Instance> = scene
+            .items
+            .iter()
+            .map(|item| instance(scene.camera_from_base, item))
+            .collect();
+        queue.write_buffer(&self.instances, 0, bytemuck::cast_slice(&instances));
 
-        let mut encoder = self.device.create_command_encoder(&Default::default());
+        let mut encoder = device.create_command_encoder(&Default::default());
         {
             let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
                 label: Some("shadow"),
-                depth_stencil_attachment: Some(depth_attachment(&self.shadow, wgpu::StoreOp::Store)),
+                depth_stencil_attachment: Some(depth_attachment(
+                    &self.shadow,
+                    wgpu::StoreOp::Store,
+                )),
                 ..Default::default()
             });
             pass.set_pipeline(&self.shadow_pipeline);
@@ -344,7 +421,11 @@ impl Renderer {
         }
         {
             let attachment = |target| {
-                let Target { multisampled, resolved_view, .. }: &Target = target;
+                let Target {
+                    multisampled,
+                    resolved_view,
+                    ..
+                }: &Target = target;
                 Some(wgpu::RenderPassColorAttachment {
                     view: multisampled,
                     depth_slice: None,
@@ -358,7 +439,10 @@ impl Renderer {
             let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
                 label: Some("scene"),
                 color_attachments: &[attachment(&self.colour), attachment(&self.robot)],
-                depth_stencil_attachment: Some(depth_attachment(&self.depth, wgpu::StoreOp::Discard)),
+                depth_stencil_attachment: Some(depth_attachment(
+                    &self.depth,
+                    wgpu::StoreOp::Discard,
+                )),
                 ..Default::default()
             });
             pass.set_bind_group(0, &self.scene_group, &[]);
@@ -384,44 +468,41 @@ impl Renderer {
                         rows_per_image: Some(HEIGHT),
                     },
                 },
-                wgpu::Extent3d { width: WIDTH, height: HEIGHT, depth_or_array_layers: 1 },
+                wgpu::Extent3d {
+                    width: WIDTH,
+                    height: HEIGHT,
+                    depth_or_array_layers: 1,
+                },
             );
         }
-        self.queue.submit([encoder.finish()]);
+        queue.submit([encoder.finish()]);
 
-        let (send, receive) = mpsc::channel();
-        self.readback.map_async(wgpu::MapMode::Read, .., move |result| {
-            // The receiver is gone only when the wait below gave up first.
-            let _ = send.send(result);
-        });
-        self.device
-            .poll(wgpu::PollType::Wait { submission_index: None, timeout: Some(TIMEOUT) })
-            .map_err(|e| fail(format!("the device did not finish a picture: {e}")))?;
-        receive
-            .recv_timeout(TIMEOUT)
-            .map_err(|e| fail(format!("the device did not hand back a picture: {e}")))?
-            .map_err(|e| fail(format!("the picture could not be read back: {e}")))?;
-        let picture = {
-            let mapped = self
-                .readback
-                .get_mapped_range(..)
-                .map_err(|e| fail(format!("the picture could not be read back: {e}")))?;
-            let (colour, robot) = mapped.split_at(4 * pixels as usize);
+        Ok(self.device.read(&self.readback, |bytes| {
+            let (colour, robot) = bytes.split_at(4 * pixels as usize);
+            let colour = colour.as_chunks::<4>().0;
             Picture {
-                rgb: colour.as_chunks::<4>().0.iter().flat_map(|&[r, g, b, _]| [r, g, b]).collect(),
-                mask: robot.iter().map(|&c| if c >= 128 { 255 } else { 0 }).collect(),
+                rgb: colour.iter().flat_map(|&[r, g, b, _]| [r, g, b]).collect(),
+                mask: robot
+                    .iter()
+                    .map(|&c| if c >= 128 { 255 } else { 0 })
+                    .collect(),
             }
-        };
-        self.readback.unmap();
-        Ok(picture)
+        })?)
     }
 
-    fn draw_items(&self, pass: &mut wgpu::RenderPass<'_>, scene: &Scene, drawn: impl Fn(Kind) -> bool) {
+    fn draw_items(
+        &self,
+        pass: &mut wgpu::RenderPass<'_>,
+        scene: &Scene,
+        drawn: impl Fn(Kind) -> bool,
+    ) {
         pass.set_vertex_buffer(0, self.vertices.slice(..));
         pass.set_vertex_buffer(1, self.instances.slice(..));
         pass.set_index_buffer(self.indices.slice(..), wgpu::IndexFormat::Uint32);
         for (i, item) in scene.items.iter().enumerate() {
-            let Some(range) = self.ranges.get(item.mesh).filter(|_| drawn(item.kind)) else { continue };
+            let Some(range) = self.ranges.get(item.mesh).filter(|_| drawn(item.kind)) else {
+                continue;
+            };
             let i = i as u32;
             let indices = range.first_index..range.first_index + range.indices;
             pass.draw_indexed(indices, range.first_vertex, i..i + 1);
@@ -435,7 +516,10 @@ fn depth_attachment(
 ) -> wgpu::RenderPassDepthStencilAttachment<'_> {
     wgpu::RenderPassDepthStencilAttachment {
         view,
-        depth_ops: Some(wgpu::Operations { load: wgpu::LoadOp::Clear(1.0), store }),
+        depth_ops: Some(wgpu::Operations {
+            load: wgpu::LoadOp::Clear(1.0),
+            store,
+        }),
         stencil_ops: None,
     }
 }
@@ -455,27 +539,33 @@ impl Pipelines<'_> {
         samples: u32,
         fragment: Option<wgpu::FragmentState<'_>>,
     ) -> wgpu::RenderPipeline {
-        let layout = self.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-            label: Some(vertex_entry),
-            bind_group_layouts: &[Some(layout)],
-            immediate_size: 0,
-        });
-        self.device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
-            label: Some(vertex_entry),
-            layout: Some(&layout),
-            vertex: wgpu::VertexState {
-                module: self.shader,
-                entry_point: Some(vertex_entry),
-                compilation_options: Default::default(),
-                buffers,
-            },
-            primitive: Default::default(),
-            depth_stencil: Some(depth),
-            multisample: wgpu::MultisampleState { count: samples, ..Default::default() },
-            fragment,
-            multiview_mask: None,
-            cache: None,
-        })
+        let layout = self
+            .device
+            .create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+                label: Some(vertex_entry),
+                bind_group_layouts: &[Some(layout)],
+                immediate_size: 0,
+            });
+        self.device
+            .create_render_pipeline(&wgpu::RenderPipelineDescriptor {
+                label: Some(vertex_entry),
+                layout: Some(&layout),
+                vertex: wgpu::VertexState {
+                    module: self.shader,
+                    entry_point: Some(vertex_entry),
+                    compilation_options: Default::default(),
+                    buffers,
+                },
+                primitive: Default::default(),
+                depth_stencil: Some(depth),
+                multisample: wgpu::MultisampleState {
+                    count: samples,
+                    ..Default::default()
+                },
+                fragment,
+                multiview_mask: None,
+                cache: None,
+            })
     }
 
     fn scene(
@@ -485,9 +575,22 @@ impl Pipelines<'_> {
         is_object: bool,
         mask_writes: wgpu::ColorWrites,
     ) -> wgpu::RenderPipeline {
-        let compare = if is_object { wgpu::CompareFunction::Less } else { wgpu::CompareFunction::LessEqual };
-        let target = |format, write_mask| Some(wgpu::ColorTargetState { format, blend: None, write_mask });
-        let targets = [target(COLOUR, wgpu::ColorWrites::ALL), target(ROBOT, mask_writes)];
+        let compare = if is_object {
+            wgpu::CompareFunction::Less
+        } else {
+            wgpu::CompareFunction::LessEqual
+        };
+        let target = |format, write_mask| {
+            Some(wgpu::ColorTargetState {
+                format,
+                blend: None,
+                write_mask,
+            })
+        };
+        let targets = [
+            target(COLOUR, wgpu::ColorWrites::ALL),
+            target(ROBOT, mask_writes),
+        ];
         let fragment_entry = format!("{entry}_fragment");
         let fragment = wgpu::FragmentState {
             module: self.shader,
@@ -495,9 +598,20 @@ impl Pipelines<'_> {
             compilation_options: Default::default(),
             targets: &targets,
         };
-        let buffers = if is_object { object_buffers().to_vec() } else { Vec::new() };
+        let buffers = if is_object {
+            object_buffers().to_vec()
+        } else {
+            Vec::new()
+        };
         let depth = depth_state(compare, is_object, 0);
-        self.make(layout, &format!("{entry}_vertex"), &buffers, depth, SAMPLES, Some(fragment))
+        self.make(
+            layout,
+            &format!("{entry}_vertex"),
+            &buffers,
+            depth,
+            SAMPLES,
+            Some(fragment),
+        )
     }
 
     fn shadow(&self, layout: &wgpu::BindGroupLayout) -> wgpu::RenderPipeline {
@@ -512,7 +626,11 @@ fn depth_state(compare: wgpu::CompareFunction, write: bool, bias: i32) -> wgpu::
         depth_write_enabled: Some(write),
         depth_compare: Some(compare),
         stencil: Default::default(),
-        bias: wgpu::DepthBiasState { constant: bias, slope_scale: bias as f32, clamp: 0.0 },
+        bias: wgpu::DepthBiasState {
+            constant: bias,
+            slope_scale: bias as f32,
+            clamp: 0.0,
+        },
     }
 }
 
@@ -536,7 +654,7 @@ fn object_buffers() -> [Option<wgpu::VertexBufferLayout<'static>>; 2] {
     ]
 }
 
-fn instance(camera_from_base: DAffine3, item: &super::scene::Item) -> Instance {
+fn instance(camera_from_base: DAffine3, item: &Item) -> Instance {
     let pose = camera_from_base * item.base_from_mesh;
     let rotation = pose.matrix3.transpose();
     let row = |axis: DVec3, shift: f64| axis.as_vec3().extend(shift as f32).to_array();
@@ -550,8 +668,18 @@ fn instance(camera_from_base: DAffine3, item: &super::scene::Item) -> Instance {
             row(rotation.z_axis, pose.translation.z),
         ],
         albedo: [r, g, b, robot],
-        finish: [material.metal, material.specular, material.shininess, material.photo],
-        texture: [material.photo_offset[0], material.photo_offset[1], material.photo_scale, 0.0],
+        finish: [
+            material.metal,
+            material.specular,
+            material.shininess,
+            material.photo,
+        ],
+        texture: [
+            material.photo_offset[0],
+            material.photo_offset[1],
+            material.photo_scale,
+            0.0,
+        ],
     }
 }
 
@@ -565,7 +693,12 @@ fn clip_from_camera() -> Mat4 {
     Mat4::from_cols(
         column(2.0 * k.fx / width, 0.0, 0.0, 0.0),
         column(0.0, -2.0 * k.fy / height, 0.0, 0.0),
-        column(2.0 * (k.cx + 0.5) / width - 1.0, 1.0 - 2.0 * (k.cy + 0.5) / height, depth, 1.0),
+        column(
+            2.0 * (k.cx + 0.5) / width - 1.0,
+            1.0 - 2.0 * (k.cy + 0.5) / height,
+            depth,
+            1.0,
+        ),
         column(0.0, 0.0, -NEAR * depth, 0.0),
     )
 }
@@ -579,11 +712,19 @@ fn view(scene: &Scene) -> View {
     let towards = directions[0];
     let side = towards.any_orthonormal_vector();
     let other = towards.cross(side);
-    let centre = scene.camera_from_base.transform_point3(scene.centre).as_vec3();
+    let centre = scene
+        .camera_from_base
+        .transform_point3(scene.centre)
+        .as_vec3();
     let scale = 0.5 / SHADOW_REACH;
     let row = |axis: Vec3, scale: f32| (axis * scale).extend(0.5 - axis.dot(centre) * scale);
     // Far from the light is deep; objects up to 4 m before and behind the centre are told apart.
-    let shadow = Mat4::from_cols(row(side, scale), row(other, scale), row(-towards, 0.125), Vec4::W);
+    let shadow = Mat4::from_cols(
+        row(side, scale),
+        row(other, scale),
+        row(-towards, 0.125),
+        Vec4::W,
+    );
 
     View {
         clip_from_camera: clip_from_camera().to_cols_array_2d(),
@@ -596,7 +737,10 @@ fn view(scene: &Scene) -> View {
             four(directions[1], 0.0),
             four(directions[2], 0.0),
         ],
-        light_colour: light.lamps.each_ref().map(|lamp| four(lamp.colour.into(), 0.0)),
+        light_colour: light
+            .lamps
+            .each_ref()
+            .map(|lamp| four(lamp.colour.into(), 0.0)),
         mirrored: light.mirrored.map(|(wave, phase)| four(turn(wave), phase)),
     }
 }

@@ -1,6 +1,7 @@
 //! A robot from its URDF: links, joints, meshes, forward kinematics.
 
 use std::collections::HashMap;
+use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
 
 use glam::{Affine3A, DAffine3, DMat3, DQuat, DVec3, Vec3};
@@ -65,24 +66,35 @@ impl Robot {
     /// joints do not form a tree.
     pub fn load(urdf: &Path, packages: &[(String, PathBuf)]) -> Result<Robot, RecordingError> {
         let text = std::fs::read_to_string(urdf).map_err(RecordingError::io(urdf))?;
-        let fail = |message: String| RecordingError::Urdf { path: urdf.to_owned(), message };
+        let fail = |message: String| RecordingError::Urdf {
+            path: urdf.to_owned(),
+            message,
+        };
         let description =
             urdf_rs::read_from_string(&text).map_err(|e| fail(format!("not a URDF: {e}")))?;
 
         let mut links = Vec::new();
         let mut index = HashMap::new();
         for link in &description.links {
-            let files = Files { urdf, packages, link: &link.name };
+            let files = Files {
+                urdf,
+                packages,
+                link: &link.name,
+            };
             let mut visual = Vec::new();
             for part in &link.visual {
                 let mut meshes = files.geometry(&part.geometry, &part.origin)?;
                 let colour = part.material.as_ref().and_then(|m| {
                     let named = description.materials.iter().find(|d| d.name == m.name);
-                    m.color.as_ref().or_else(|| named.and_then(|d| d.color.as_ref()))
+                    m.color
+                        .as_ref()
+                        .or_else(|| named.and_then(|d| d.color.as_ref()))
                 });
                 if let Some(colour) = colour {
                     let [r, g, b, _] = *colour.rgba;
-                    meshes.iter_mut().for_each(|m| m.diffuse = Some([r as f32, g as f32, b as f32]));
+                    meshes
+                        .iter_mut()
+                        .for_each(|m| m.diffuse = Some([r as f32, g as f32, b as f32]));
                 }
                 visual.append(&mut meshes);
             }
@@ -94,12 +106,19 @@ impl Robot {
                 collision.clone_from(&visual);
             }
             index.insert(link.name.as_str(), links.len());
-            links.push(Link { name: link.name.clone(), visual, collision, parent: None });
+            links.push(Link {
+                name: link.name.clone(),
+                visual,
+                collision,
+                parent: None,
+            });
         }
 
         let find = |name: &str, joint: &str| {
             index.get(name).copied().ok_or_else(|| {
-                fail(format!("joint \"{joint}\" names the link \"{name}\", which does not exist"))
+                fail(format!(
+                    "joint \"{joint}\" names the link \"{name}\", which does not exist"
+                ))
             })
         };
         let mut hanging: HashMap<usize, Vec<(&urdf_rs::Joint, usize)>> = HashMap::new();
@@ -109,7 +128,9 @@ impl Robot {
             let slot = links.get_mut(child).map(|l| &mut l.parent);
             if let Some(Some(_)) = slot {
                 let name = &joint.child.link;
-                return Err(fail(format!("the link \"{name}\" hangs on more than one joint")));
+                return Err(fail(format!(
+                    "the link \"{name}\" hangs on more than one joint"
+                )));
             }
             if let Some(slot) = slot {
                 *slot = Some(parent);
@@ -119,36 +140,74 @@ impl Robot {
 
         let mut joints: Vec<Joint> = Vec::new();
         let mut steps = Vec::new();
-        let mut open: Vec<usize> =
-            (0..links.len()).filter(|&i| links.get(i).is_some_and(|l| l.parent.is_none())).collect();
+        let mut open: Vec<usize> = (0..links.len())
+            .filter(|&i| links.get(i).is_some_and(|l| l.parent.is_none()))
+            .collect();
         while let Some(parent) = open.pop() {
             for &(joint, child) in hanging.get(&parent).into_iter().flatten() {
-                let turns = matches!(joint.joint_type, JointType::Revolute | JointType::Continuous);
+                let turns = matches!(
+                    joint.joint_type,
+                    JointType::Revolute | JointType::Continuous
+                );
                 let moved_by = turns.then(|| {
                     let range = match joint.joint_type {
-                        JointType::Revolute => [joint.limit.lower, joint.limit.upper],
-                        _ => [-std::f64::consts::PI, std::f64::consts::PI],
+                        // Limits left out read as infinite.
+                        JointType::Revolute if joint.limit.upper < f64::INFINITY => {
+                            [joint.limit.lower, joint.limit.upper]
+                        }
+                        _ => [-PI, PI],
                     };
-                    let name = joint.name.strip_suffix("_joint").unwrap_or(&joint.name).to_owned();
-                    joints.push(Joint { name, range, child, parent });
-                    (DVec3::from(*joint.axis.xyz).normalize_or(DVec3::X), joints.len() - 1)
+                    let name = joint
+                        .name
+                        .strip_suffix("_joint")
+                        .unwrap_or(&joint.name)
+                        .to_owned();
+                    joints.push(Joint {
+                        name,
+                        range,
+                        child,
+                        parent,
+                    });
+                    (
+                        DVec3::from(*joint.axis.xyz).normalize_or(DVec3::X),
+                        joints.len() - 1,
+                    )
                 });
-                steps.push(Step { parent, child, origin: pose(&joint.origin), moved_by });
+                steps.push(Step {
+                    parent,
+                    child,
+                    origin: pose(&joint.origin),
+                    moved_by,
+                });
                 open.push(child);
             }
         }
         if steps.len() != description.joints.len() {
-            return Err(fail("expected the joints to form a tree, found a loop".into()));
+            return Err(fail(
+                "expected the joints to form a tree, found a loop".into(),
+            ));
         }
         let Some(first) = joints.first() else {
-            return Err(fail("expected at least one revolute joint, found none".into()));
+            return Err(fail(
+                "expected at least one revolute joint, found none".into(),
+            ));
         };
-        if let Some(bad) = joints.iter().find(|j| !(j.range[0] <= j.range[1])) {
+        if let Some(bad) = joints
+            .iter()
+            .find(|j| !(0.0..f64::INFINITY).contains(&(j.range[1] - j.range[0])))
+        {
             let ([lower, upper], name) = (bad.range, &bad.name);
-            return Err(fail(format!("joint \"{name}\": expected lower <= upper, found {lower} and {upper}")));
+            return Err(fail(format!(
+                "joint \"{name}\": expected a finite range, found {lower} to {upper}"
+            )));
         }
         let base = first.parent;
-        Ok(Robot { links, joints, steps, base })
+        Ok(Robot {
+            links,
+            joints,
+            steps,
+            base,
+        })
     }
 
     /// Poses of all links in the base frame (the frame of the first joint's parent link), in the order
@@ -173,7 +232,10 @@ impl Robot {
     /// Origins of the moving joints' frames in the base frame, metres, from link poses.
     pub fn joint_origins(&self, link_poses: &[DAffine3]) -> Vec<DVec3> {
         let pose = |link| link_poses.get(link).copied().unwrap_or_default();
-        self.joints.iter().map(|j| pose(j.child).translation).collect()
+        self.joints
+            .iter()
+            .map(|j| pose(j.child).translation)
+            .collect()
     }
 
     /// The link that carries the first moving joint.
@@ -209,16 +271,19 @@ impl Files<'_> {
         let size = |v: [f64; 3]| Affine3A::from_scale(Vec3::from(v.map(|c| c as f32)));
         let (mut meshes, scale) = match geometry {
             Geometry::Box { size: edges } => (vec![Mesh::cuboid()], size(**edges)),
-            Geometry::Cylinder { radius, length } | Geometry::Capsule { radius, length } => {
-                (vec![Mesh::cylinder()], size([2.0 * radius, 2.0 * radius, *length]))
-            }
+            Geometry::Cylinder { radius, length } | Geometry::Capsule { radius, length } => (
+                vec![Mesh::cylinder()],
+                size([2.0 * radius, 2.0 * radius, *length]),
+            ),
             Geometry::Sphere { radius } => (vec![Mesh::sphere()], size([2.0 * radius; 3])),
-            Geometry::Mesh { filename, scale } => {
-                (Mesh::read(&self.find(filename)?)?, size(scale.map_or([1.0; 3], |s| *s)))
-            }
+            Geometry::Mesh { filename, scale } => (
+                Mesh::read(&self.find(filename)?)?,
+                size(scale.map_or([1.0; 3], |s| *s)),
+            ),
         };
         let origin = pose(origin);
-        let placed = Affine3A::from_mat3_translation(origin.matrix3.as_mat3(), origin.translation.as_vec3());
+        let placed =
+            Affine3A::from_mat3_translation(origin.matrix3.as_mat3(), origin.translation.as_vec3());
         meshes.iter_mut().for_each(|m| m.transform(placed * scale));
         Ok(meshes)
     }
@@ -234,12 +299,20 @@ impl Files<'_> {
         };
         let Some(inside) = name.strip_prefix("package://") else {
             let path = folder.join(name.strip_prefix("file://").unwrap_or(name));
-            return if path.is_file() { Ok(path) } else { Err(missing(path)) };
+            return if path.is_file() {
+                Ok(path)
+            } else {
+                Err(missing(path))
+            };
         };
         let (package, rest) = inside.split_once('/').unwrap_or((inside, ""));
         if let Some((_, root)) = self.packages.iter().find(|(n, _)| n == package) {
             let path = root.join(rest);
-            return if path.is_file() { Ok(path) } else { Err(missing(path)) };
+            return if path.is_file() {
+                Ok(path)
+            } else {
+                Err(missing(path))
+            };
         }
         let absolute = std::path::absolute(folder).map_err(RecordingError::io(folder))?;
         absolute
