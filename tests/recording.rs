@@ -280,11 +280,7 @@ fn collisions_are_found() {
     ] {
         let poses = robot.link_poses(&angles);
         assert_eq!(model.self_collision(&poses), itself, "{angles:?}");
-        assert_eq!(
-            model.floor_collision(&poses, 0.09),
-            floor,
-            "{angles:?}"
-        );
+        assert_eq!(model.floor_collision(&poses, 0.09), floor, "{angles:?}");
         assert!(!model.floor_collision(&poses, 0.0));
     }
 }
