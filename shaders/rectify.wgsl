@@ -63,18 +63,20 @@ fn ray_of(pixel: vec2<f32>) -> vec2<f32> {
     return (pixel - params.canonical.zw) * params.canonical.xy;
 }
 
-// Bilinear; black outside the source, whose outermost pixels reach half a pixel out.
+fn load(at: vec2<i32>) -> vec3<f32> {
+    let inside = all(at >= vec2(0)) && all(at < vec2<i32>(params.size));
+    return select(vec3(0.0), textureLoad(source, clamp(at, vec2(0), vec2<i32>(params.size) - 1), 0).rgb, inside);
+}
+
+// Bilinear, as if black pixels lay round the source: without a step at its border.
 fn sample(at: vec2<f32>) -> vec3<f32> {
-    if !(all(at >= vec2(-0.5)) && all(at <= params.size - 0.5)) {
+    if !(all(at > vec2(-1.0)) && all(at < params.size)) {
         return vec3(0.0);
     }
-    let last = vec2<i32>(params.size) - 1;
-    let corner = floor(at);
-    let part = at - corner;
-    let low = clamp(vec2<i32>(corner), vec2(0), last);
-    let high = clamp(vec2<i32>(corner) + 1, vec2(0), last);
-    let top = mix(textureLoad(source, low, 0).rgb, textureLoad(source, vec2(high.x, low.y), 0).rgb, part.x);
-    let bottom = mix(textureLoad(source, vec2(low.x, high.y), 0).rgb, textureLoad(source, high, 0).rgb, part.x);
+    let corner = vec2<i32>(floor(at));
+    let part = at - floor(at);
+    let top = mix(load(corner), load(corner + vec2(1, 0)), part.x);
+    let bottom = mix(load(corner + vec2(0, 1)), load(corner + vec2(1, 1)), part.x);
     return mix(top, bottom, part.y);
 }
 

@@ -67,12 +67,13 @@ impl Rectification {
 /// whole image, and a hundredth of a pixel of play, so that rounding cannot change the number of
 /// samples from one machine to the next.
 fn footprint(source: &Camera, canonical: &Intrinsics, width: u32, height: u32) -> [f64; 2] {
+    let limit = source.max_radius();
     let pixel = |u: f64, v: f64| {
         let ray = [
             (u - canonical.cx) / canonical.fx,
             (v - canonical.cy) / canonical.fy,
         ];
-        (ray[0].hypot(ray[1]) <= source.max_radius()).then(|| source.pixel_of_ray(ray))
+        (ray[0].hypot(ray[1]) <= limit).then(|| source.pixel_of_ray(ray))
     };
     let inside = |[u, v]: [f64; 2]| {
         (-0.5..=f64::from(source.width) - 0.5).contains(&u)

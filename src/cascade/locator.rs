@@ -4,7 +4,7 @@ use image::RgbaImage;
 
 use super::view::View;
 use super::{Estimate, Joint, Mask, Status};
-use crate::camera::{Camera, Rectification};
+use crate::camera::{Camera, Lens, Rectification};
 use crate::gpu::{Device, Frame, GpuError, Plan};
 use crate::network::{Description, Model};
 use crate::reference;
@@ -159,7 +159,7 @@ impl Locator {
         } else if output.mask_only {
             (Status::Found, Vec::new())
         } else {
-            match joints(&frame.joints, &description.joints, &view.camera) {
+            match joints(&frame.joints, &description.joints, &view.lens) {
                 Some(joints) => (Status::Found, joints),
                 None => (Status::Invalid, Vec::new()),
             }
@@ -179,18 +179,18 @@ impl Locator {
     }
 }
 
-/// The joints in the camera's image; `None` unless all are finite and in front of the camera.
-fn joints(values: &[f32], names: &[String], camera: &Camera) -> Option<Vec<Joint>> {
+/// The joints in the camera's image; `None` unless all are finite, in front of the camera and where
+/// its lens can show them.
+fn joints(values: &[f32], names: &[String], lens: &Lens) -> Option<Vec<Joint>> {
     values
         .chunks_exact(3)
         .zip(names)
         .map(|(xyz, name)| {
             let xyz_m = [xyz[0], xyz[1], xyz[2]].map(f64::from);
-            let px = camera.project(xyz_m)?;
-            (xyz_m.iter().all(|v| v.is_finite())).then(|| Joint {
+            Some(Joint {
                 name: name.clone(),
                 xyz_m,
-                px,
+                px: lens.project(xyz_m)?,
             })
         })
         .collect()

@@ -1,9 +1,11 @@
-use crate::camera::{Camera, Intrinsics, Rectification};
+use crate::camera::{Camera, Intrinsics, Lens, Rectification};
 
 /// What the networks see of a camera's image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct View {
     pub camera: Camera,
+    /// That of `camera`.
+    pub lens: Lens,
     canonical: Intrinsics,
     /// How the image becomes the canonical one.
     pub rectification: Rectification,
@@ -18,6 +20,7 @@ impl View {
     pub fn new(camera: &Camera, canonical: &Intrinsics, width: u32, height: u32) -> Self {
         let mut view = Self {
             camera: *camera,
+            lens: camera.lens(),
             canonical: *canonical,
             rectification: Rectification::new(camera, canonical, width, height),
             field: camera.field_of(canonical, width, height),
@@ -38,7 +41,7 @@ impl View {
     /// Where the camera sees what the canonical camera sees at `pixel`; `None` where its lens shows
     /// nothing.
     fn source_pixel(&self, [u, v]: [f64; 2]) -> Option<[f64; 2]> {
-        self.camera.project([
+        self.lens.project([
             (u - self.canonical.cx) / self.canonical.fx,
             (v - self.canonical.cy) / self.canonical.fy,
             1.0,

@@ -272,21 +272,18 @@ impl<'a> Collada<'a> {
                 continue;
             }
             let values = numbers::<f32>(element);
-            pose = pose
-                * match (name, values.as_deref()) {
-                    ("matrix", Some(m)) if m.len() == 16 => {
-                        Affine3A::from_mat4(Mat4::from_cols_slice(m).transpose())
-                    }
-                    ("translate", Some(&[x, y, z])) => {
-                        Affine3A::from_translation(Vec3::new(x, y, z))
-                    }
-                    ("scale", Some(&[x, y, z])) => Affine3A::from_scale(Vec3::new(x, y, z)),
-                    ("rotate", Some(&[x, y, z, degrees])) => {
-                        let axis = Vec3::new(x, y, z).normalize_or(Vec3::Z);
-                        Affine3A::from_axis_angle(axis, degrees.to_radians())
-                    }
-                    _ => return Err(self.error(format!("a <{name}> has the wrong numbers"))),
-                };
+            pose *= match (name, values.as_deref()) {
+                ("matrix", Some(m)) if m.len() == 16 => {
+                    Affine3A::from_mat4(Mat4::from_cols_slice(m).transpose())
+                }
+                ("translate", Some(&[x, y, z])) => Affine3A::from_translation(Vec3::new(x, y, z)),
+                ("scale", Some(&[x, y, z])) => Affine3A::from_scale(Vec3::new(x, y, z)),
+                ("rotate", Some(&[x, y, z, degrees])) => {
+                    let axis = Vec3::new(x, y, z).normalize_or(Vec3::Z);
+                    Affine3A::from_axis_angle(axis, degrees.to_radians())
+                }
+                _ => return Err(self.error(format!("a <{name}> has the wrong numbers"))),
+            };
         }
         for instance in children(node, "instance_geometry") {
             let geometry = self.follow(instance.attribute("url"))?;

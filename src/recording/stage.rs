@@ -440,10 +440,10 @@ impl Stage {
         }
         build.room(floor, rng);
         build.clutter(&support, floor, robot.is_none(), rng);
-        if let Some((_, poses)) = &robot {
-            if rng.random_bool(0.25) {
-                build.occluders(&self.robot.joint_origins(poses), rng);
-            }
+        if let Some((_, poses)) = &robot
+            && rng.random_bool(0.25)
+        {
+            build.occluders(&self.robot.joint_origins(poses), rng);
         }
         let posed = robot.map(|(angles, poses)| Posed {
             angles,

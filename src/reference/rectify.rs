@@ -1,4 +1,4 @@
-use image::RgbaImage;
+use image::{Rgba, RgbaImage};
 use rayon::prelude::*;
 
 use super::Tensor;
@@ -99,23 +99,23 @@ fn project(params: &Rectification, ray: [f32; 2]) -> [f32; 2] {
     [bent[0] * fx + cx, bent[1] * fy + cy]
 }
 
-/// Bilinear; black outside the source, whose outermost pixels reach half a pixel out.
+/// Bilinear, as if black pixels lay round the source: without a step at its border.
 fn sample(image: &RgbaImage, [x, y]: [f32; 2]) -> [f32; 3] {
     let (width, height) = image.dimensions();
-    let inside = |at: f32, side: u32| at >= -0.5 && at <= side as f32 - 0.5;
-    if !(inside(x, width) && inside(y, height)) {
+    if !(x > -1.0 && y > -1.0 && x < width as f32 && y < height as f32) {
         return [0.0; 3];
     }
-    let clamp = |at: f32, side: u32| (at.max(0.0) as u32).min(side - 1);
-    let (x0, x1) = (clamp(x.floor(), width), clamp(x.floor() + 1.0, width));
-    let (y0, y1) = (clamp(y.floor(), height), clamp(y.floor() + 1.0, height));
-    let (part_x, part_y) = (x - x.floor(), y - y.floor());
-    let load = |x, y| {
-        let [r, g, b, _] = image.get_pixel(x, y).0;
-        [r, g, b].map(|v| f32::from(v) / 255.0)
+    let load = |x: i64, y: i64| {
+        let pixel = u32::try_from(x).ok().zip(u32::try_from(y).ok());
+        match pixel.and_then(|(x, y)| image.get_pixel_checked(x, y)) {
+            Some(Rgba([r, g, b, _])) => [*r, *g, *b].map(|v| f32::from(v) / 255.0),
+            None => [0.0; 3],
+        }
     };
     let mix = |a: [f32; 3], b: [f32; 3], t: f32| [0, 1, 2].map(|i| a[i] * (1.0 - t) + b[i] * t);
-    let top = mix(load(x0, y0), load(x1, y0), part_x);
-    let bottom = mix(load(x0, y1), load(x1, y1), part_x);
+    let (column, row) = (x.floor() as i64, y.floor() as i64);
+    let (part_x, part_y) = (x - x.floor(), y - y.floor());
+    let top = mix(load(column, row), load(column + 1, row), part_x);
+    let bottom = mix(load(column, row + 1), load(column + 1, row + 1), part_x);
     mix(top, bottom, part_y)
 }
