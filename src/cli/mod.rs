@@ -4,6 +4,7 @@ mod adapters;
 mod info;
 mod locate;
 mod photo;
+mod record;
 mod weights;
 
 use std::io::{self, Write};
@@ -19,6 +20,7 @@ enum Command {
     Locate(locate::Args),
     Adapters(adapters::Args),
     Info(info::Args),
+    Record(record::Args),
 }
 
 /// Runs the command line of this process. Exit codes: 0 done, 1 failed, 2 wrong usage.
@@ -34,6 +36,7 @@ pub fn main() -> ExitCode {
         Command::Locate(args) => locate::run(args),
         Command::Adapters(args) => adapters::run(&args),
         Command::Info(args) => info::run(&args),
+        Command::Record(args) => record::run(args),
     };
     done.unwrap_or_else(|error| {
         if is_broken_pipe(&error) {
