@@ -3,6 +3,13 @@
 //! Points are in the camera optical frame of REP 103 (x right, y down, z forward, metres);
 //! pixel (0, 0) is the centre of the top-left pixel.
 
+mod calibration;
+mod camera_info;
 mod intrinsics;
+mod lens;
+mod rectification;
 
+pub use calibration::{Camera, CameraError};
 pub use intrinsics::Intrinsics;
+pub use lens::{Distortion, Lens};
+pub use rectification::Rectification;

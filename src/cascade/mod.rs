@@ -1,1 +1,8 @@
 //! A frame in, an estimate out: the API that other programs embed.
+
+mod estimate;
+mod locator;
+mod view;
+
+pub use estimate::{Estimate, Joint, Mask, Status};
+pub use locator::{LocateError, Locator, Output};

@@ -1,8 +1,67 @@
 //! The command line: one file a command.
 
+mod adapters;
+mod info;
+mod locate;
+mod photo;
+mod record;
+mod weights;
+
+use std::io::{self, Write};
 use std::process::ExitCode;
+
+use clap::Parser;
+
+use crate::gpu::GpuError;
+
+#[derive(Debug, Parser)]
+#[command(version, about)]
+enum Command {
+    Locate(locate::Args),
+    Adapters(adapters::Args),
+    Info(info::Args),
+    Record(record::Args),
+}
 
 /// Runs the command line of this process. Exit codes: 0 done, 1 failed, 2 wrong usage.
 pub fn main() -> ExitCode {
-    ExitCode::SUCCESS
+    // What a driver has to say is for those who ask with RUST_LOG; its errors come back as values.
+    let filter = env_logger::Env::default()
+        .default_filter_or("warn,wgpu_core=error,wgpu_hal=off,naga=error");
+    env_logger::Builder::from_env(filter)
+        .format_timestamp(None)
+        .format_target(false)
+        .init();
+    let done = match Command::parse() {
+        Command::Locate(args) => locate::run(args),
+        Command::Adapters(args) => adapters::run(&args),
+        Command::Info(args) => info::run(&args),
+        Command::Record(args) => record::run(args),
+    };
+    done.unwrap_or_else(|error| {
+        if is_broken_pipe(&error) {
+            // The reader, such as `head`, has what it wanted.
+            return ExitCode::SUCCESS;
+        }
+        // Nobody is left to tell where stderr is gone too.
+        let _ = writeln!(io::stderr(), "error: {error:#}");
+        if is_wrong_usage(&error) {
+            ExitCode::from(2)
+        } else {
+            ExitCode::FAILURE
+        }
+    })
+}
+
+fn is_broken_pipe(error: &anyhow::Error) -> bool {
+    error
+        .downcast_ref::<io::Error>()
+        .is_some_and(|e| e.kind() == io::ErrorKind::BrokenPipe)
+}
+
+fn is_wrong_usage(error: &anyhow::Error) -> bool {
+    matches!(
+        error.downcast_ref::<GpuError>(),
+        Some(GpuError::UnknownAdapter { .. } | GpuError::UnknownBackend { .. })
+    )
 }

@@ -1,1 +1,29 @@
 //! The layers of a network as compute kernels on wgpu.
+
+mod adapter;
+mod concat;
+mod conv2d;
+mod coverage;
+mod dense;
+mod device;
+mod error;
+mod max_pool2d;
+mod network;
+mod overlay;
+mod plan;
+mod rectify;
+mod sigmoid;
+mod step;
+mod tensor;
+mod upsample2d;
+
+pub use adapter::{AdapterReport, AdapterRequest, Choice, Wanted, list_adapters};
+pub use coverage::{Totals, coverage};
+pub use device::{Device, Tier};
+pub use error::GpuError;
+pub use network::NetworkPlan;
+pub use overlay::overlay;
+pub use plan::{Frame, Plan};
+pub use rectify::Rectify;
+pub use step::Step;
+pub use tensor::Tensor;

@@ -1,1 +1,196 @@
 //! Data sets: robot kinematics, rendering new recordings, reading and writing them.
+//!
+//! Points are in metres, in the camera optical frame (x right, y down, z forward) or in the robot's
+//! base frame (the frame of the first joint's parent link, z up), as each name says.
+
+mod background;
+mod chance;
+mod collision;
+mod effects;
+mod error;
+mod format;
+mod mesh;
+mod props;
+mod render;
+mod robot;
+mod scene;
+mod stage;
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Mutex, mpsc};
+
+pub use background::{Backgrounds, PhotoView};
+pub use collision::CollisionModel;
+pub use effects::Effects;
+pub use error::RecordingError;
+pub use format::{Header, Protocol, Sample, Source, Writer, write_picture};
+pub use mesh::Mesh;
+pub use render::{Picture, Renderer};
+pub use robot::{Joint, Link, Robot};
+pub use scene::{Item, Kind, Lamp, Lighting, Material, Scene};
+pub use stage::{Posed, Shot, Stage, Station};
+
+use crate::camera::Intrinsics;
+use crate::gpu::Device;
+
+/// Width of recorded images, pixels.
+pub const WIDTH: u32 = 512;
+/// Height of recorded images, pixels.
+pub const HEIGHT: u32 = 424;
+/// The recorder's camera: that of the Kinect V2's depth image.
+pub const INTRINSICS: Intrinsics = Intrinsics {
+    fx: 365.0,
+    fy: 365.0,
+    cx: 255.5,
+    cy: 211.5,
+};
+
+/// What to record.
+#[derive(Debug, Clone)]
+pub struct Request {
+    /// The robot description.
+    pub urdf: PathBuf,
+    /// Where `package://NAME/` is, for packages that are not found upwards from the URDF.
+    pub packages: Vec<(String, PathBuf)>,
+    /// The robot's name, for the header.
+    pub robot: String,
+    /// A folder of background photos.
+    pub backgrounds: PathBuf,
+    /// How many samples.
+    pub samples: u64,
+    /// Samples are drawn from this seed and their number alone.
+    pub seed: u64,
+    /// How camera and robot move.
+    pub protocol: Protocol,
+    /// The recording's folder.
+    pub out: PathBuf,
+}
+
+/// Renders a recording; goes on with one that was cut off. `progress` hears how many samples are done.
+///
+/// # Errors
+/// The request cannot be carried out, the device fails or a file cannot be written. Samples written so
+/// far stay.
+pub fn record(
+    device: &Device,
+    request: &Request,
+    progress: impl Fn(u64),
+) -> Result<(), RecordingError> {
+    let backgrounds = Backgrounds::open(&request.backgrounds)?;
+    let stage = Stage::load(&request.urdf, &request.packages)?;
+    let header = Header {
+        format: "whereabot-recording".into(),
+        version: 1,
+        robot: request.robot.clone(),
+        joints: stage
+            .robot()
+            .joints
+            .iter()
+            .map(|j| j.name.clone())
+            .collect(),
+        width: WIDTH,
+        height: HEIGHT,
+        frame: "camera_optical".into(),
+        source: Source {
+            kind: "synthetic".into(),
+            generator: concat!("whereabot ", env!("CARGO_PKG_VERSION")).into(),
+            seed: request.seed,
+            urdf: request
+                .urdf
+                .file_name()
+                .map(|n| n.to_string_lossy().into_owned())
+                .unwrap_or_default(),
+            protocol: request.protocol,
+        },
+    };
+    let station = match request.protocol {
+        Protocol::FixedCamera => Some(stage.station(request.seed)?),
+        Protocol::FreeCamera => None,
+    };
+    let renderer = Mutex::new(Renderer::new(device, stage.meshes())?);
+    let mut writer = Writer::open(&request.out, &header)?;
+    let folder = writer.folder().to_owned();
+    progress(writer.next());
+
+    let make = |id: u64| -> Result<Sample, RecordingError> {
+        let shot = match &station {
+            Some(station) => stage.fixed_shot(station, id, backgrounds.count())?,
+            None => stage.free_shot(request.seed, id, backgrounds.count())?,
+        };
+        let background = backgrounds.view(&shot.background)?;
+        let texture = shot
+            .texture
+            .as_ref()
+            .map(|view| backgrounds.view(view))
+            .transpose()?;
+        let mut picture = renderer
+            .lock()
+            .unwrap_or_else(std::sync::PoisonError::into_inner)
+            .draw(&shot.scene, &background, texture.as_deref())?;
+        shot.effects.apply(&mut picture.rgb);
+        let sample = describe(id, &shot, &picture);
+        write_picture(&folder, &sample, &picture)?;
+        Ok(sample)
+    };
+
+    // Each worker makes whole samples; only drawing is one at a time.
+    let workers = std::thread::available_parallelism().map_or(1, |n| n.get());
+    let next = AtomicU64::new(writer.next());
+    let stop = AtomicBool::new(false);
+    let (send, receive) = mpsc::sync_channel(workers);
+    std::thread::scope(|scope| {
+        for _ in 0..workers {
+            let (send, next, stop, make) = (send.clone(), &next, &stop, &make);
+            scope.spawn(move || {
+                while !stop.load(Ordering::Relaxed) {
+                    let id = next.fetch_add(1, Ordering::Relaxed);
+                    if id >= request.samples || send.send((id, make(id))).is_err() {
+                        return;
+                    }
+                }
+            });
+        }
+        drop(send);
+        let mut waiting = BTreeMap::new();
+        let mut append = || {
+            for (id, sample) in &receive {
+                waiting.insert(id, sample?);
+                while let Some(sample) = waiting.remove(&writer.next()) {
+                    writer.append(&sample)?;
+                    progress(writer.next());
+                }
+            }
+            Ok(())
+        };
+        let result = append();
+        stop.store(true, Ordering::Relaxed);
+        drop(receive);
+        result
+    })
+}
+
+fn describe(id: u64, shot: &Shot, picture: &Picture) -> Sample {
+    let covered = picture.mask.iter().filter(|&&m| m > 0).count();
+    let matrix = glam::DMat4::from(shot.scene.camera_from_base)
+        .transpose()
+        .to_cols_array();
+    let robot = shot.robot.as_ref();
+    Sample {
+        id,
+        image: format!("image/{id:06}.jpg"),
+        mask: format!("mask/{id:06}.png"),
+        intrinsics: INTRINSICS,
+        camera_from_base: robot.map(|_| matrix),
+        joint_angles_rad: robot.map(|r| r.angles.clone()),
+        joints_m: robot.map(|r| r.joints.iter().map(|j| j.to_array()).collect()),
+        joints_px: robot.map(|r| {
+            r.joints
+                .iter()
+                .filter_map(|j| INTRINSICS.project(j.to_array()))
+                .collect()
+        }),
+        coverage: covered as f64 / picture.mask.len() as f64,
+    }
+}

@@ -1,0 +1,102 @@
+// Convolution with stride 1, dilation and zero padding 'same'; bias and activation fused.
+//
+// Activations are [image][channel / 4][row][column] of vec4. An invocation makes COLUMNS pixels of
+// one row, TILES apart so that neighbouring invocations read neighbouring texels, in eight output
+// channels: two blocks of four.
+
+override IN_BLOCKS: u32;
+override OUT_BLOCKS: u32;
+override HEIGHT: u32;
+override WIDTH: u32;
+override BATCH: u32;
+override KERNEL: u32;
+override DILATION: u32;
+// 0 none, 1 ReLU, 2 sigmoid
+override ACTIVATION: u32;
+
+const COLUMNS = 4u;
+override TILES: u32 = (WIDTH + COLUMNS - 1u) / COLUMNS;
+override OUT_PAIRS: u32 = (OUT_BLOCKS + 1u) / 2u;
+override INVOCATIONS: u32 = BATCH * OUT_PAIRS * HEIGHT * TILES;
+
+@group(0) @binding(0) var<storage, read> input: array<vec4<f32>>;
+// [out block][kernel row][kernel column][in block], a column of the matrix for each input channel
+@group(0) @binding(1) var<storage, read> weights: array<mat4x4<f32>>;
+// [out block]
+@group(0) @binding(2) var<storage, read> bias: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read_write> output: array<vec4<f32>>;
+
+fn activate(x: vec4<f32>) -> vec4<f32> {
+    if ACTIVATION == 1u {
+        return max(x, vec4(0.0));
+    }
+    if ACTIVATION == 2u {
+        return 1.0 / (1.0 + exp(-x));
+    }
+    return x;
+}
+
+@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let index = (group.y * groups.x + group.x) * 64u + local;
+    if index >= INVOCATIONS {
+        return;
+    }
+    let tile = index % TILES;
+    let y = index / TILES % HEIGHT;
+    let pair = index / (TILES * HEIGHT) % OUT_PAIRS;
+    let image = index / (TILES * HEIGHT * OUT_PAIRS);
+    let first = 2u * pair;
+    let second = min(first + 1u, OUT_BLOCKS - 1u);
+
+    var low: array<vec4<f32>, COLUMNS>;
+    var high: array<vec4<f32>, COLUMNS>;
+    for (var i = 0u; i < COLUMNS; i++) {
+        low[i] = bias[first];
+        high[i] = bias[second];
+    }
+
+    let reach = i32(KERNEL / 2u * DILATION);
+    let taps = KERNEL * KERNEL * IN_BLOCKS;
+    for (var ky = 0u; ky < KERNEL; ky++) {
+        let in_y = i32(y + ky * DILATION) - reach;
+        if in_y < 0 || in_y >= i32(HEIGHT) {
+            continue;
+        }
+        for (var kx = 0u; kx < KERNEL; kx++) {
+            var inside: array<bool, COLUMNS>;
+            var offset: array<u32, COLUMNS>;
+            for (var i = 0u; i < COLUMNS; i++) {
+                let in_x = i32(tile + i * TILES + kx * DILATION) - reach;
+                inside[i] = in_x >= 0 && in_x < i32(WIDTH);
+                offset[i] = (image * IN_BLOCKS * HEIGHT + u32(in_y)) * WIDTH
+                    + u32(clamp(in_x, 0, i32(WIDTH) - 1));
+            }
+            let tap = (ky * KERNEL + kx) * IN_BLOCKS;
+            for (var block = 0u; block < IN_BLOCKS; block++) {
+                let weight_low = weights[first * taps + tap + block];
+                let weight_high = weights[second * taps + tap + block];
+                for (var i = 0u; i < COLUMNS; i++) {
+                    let value = select(vec4(0.0), input[offset[i] + block * HEIGHT * WIDTH], inside[i]);
+                    low[i] += weight_low * value;
+                    high[i] += weight_high * value;
+                }
+            }
+        }
+    }
+
+    for (var i = 0u; i < COLUMNS; i++) {
+        let x = tile + i * TILES;
+        if x < WIDTH {
+            let at = ((image * OUT_BLOCKS + first) * HEIGHT + y) * WIDTH + x;
+            output[at] = activate(low[i]);
+            if second != first {
+                output[at + HEIGHT * WIDTH] = activate(high[i]);
+            }
+        }
+    }
+}

@@ -1,0 +1,69 @@
+// Counts and bounds the pixels of each mask that reach THRESHOLD, and counts those that are not
+// finite. A workgroup reduces its 256 pixels, then adds them to its image's totals.
+
+override WIDTH: u32;
+override HEIGHT: u32;
+override BATCH: u32;
+override THRESHOLD: f32;
+
+override GROUPS: u32 = (WIDTH * HEIGHT + 255u) / 256u;
+
+struct Totals {
+    pixels: atomic<u32>,
+    not_finite: atomic<u32>,
+    // The greatest of WIDTH - x, HEIGHT - y, x + 1 and y + 1: zero, to which the buffer is cleared,
+    // stands for no pixel.
+    from_right: atomic<u32>,
+    from_bottom: atomic<u32>,
+    from_left: atomic<u32>,
+    from_top: atomic<u32>,
+}
+
+@group(0) @binding(0) var<storage, read> mask: array<vec4<f32>>;
+// [image], cleared before
+@group(0) @binding(1) var<storage, read_write> totals: array<Totals>;
+
+var<workgroup> pixels: atomic<u32>;
+var<workgroup> not_finite: atomic<u32>;
+var<workgroup> from_right: atomic<u32>;
+var<workgroup> from_bottom: atomic<u32>;
+var<workgroup> from_left: atomic<u32>;
+var<workgroup> from_top: atomic<u32>;
+
+@compute @workgroup_size(256)
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let group_index = group.y * groups.x + group.x;
+    let image = group_index / GROUPS;
+    let pixel = group_index % GROUPS * 256u + local;
+    if image < BATCH && pixel < WIDTH * HEIGHT {
+        let probability = mask[image * WIDTH * HEIGHT + pixel].x;
+        // By its bits: a compiler may assume that a float is a number.
+        let finite = (bitcast<u32>(probability) & 0x7f800000u) != 0x7f800000u;
+        if !finite {
+            atomicAdd(&not_finite, 1u);
+        } else if probability >= THRESHOLD {
+            let x = pixel % WIDTH;
+            let y = pixel / WIDTH;
+            atomicAdd(&pixels, 1u);
+            atomicMax(&from_right, WIDTH - x);
+            atomicMax(&from_bottom, HEIGHT - y);
+            atomicMax(&from_left, x + 1u);
+            atomicMax(&from_top, y + 1u);
+        }
+    }
+    workgroupBarrier();
+    if local == 0u && image < BATCH {
+        atomicAdd(&totals[image].not_finite, atomicLoad(&not_finite));
+        if atomicLoad(&pixels) > 0u {
+            atomicAdd(&totals[image].pixels, atomicLoad(&pixels));
+            atomicMax(&totals[image].from_right, atomicLoad(&from_right));
+            atomicMax(&totals[image].from_bottom, atomicLoad(&from_bottom));
+            atomicMax(&totals[image].from_left, atomicLoad(&from_left));
+            atomicMax(&totals[image].from_top, atomicLoad(&from_top));
+        }
+    }
+}

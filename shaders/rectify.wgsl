@@ -1,0 +1,110 @@
+// Undistorts and resamples a camera's image into the canonical pinhole camera of the networks.
+//
+// An output pixel is the mean of a grid of bilinear samples over its footprint in the source, as
+// many as the footprint has pixels: nothing is skipped when the image shrinks. What the source does
+// not show is black. Formulas: OpenCV's camera models; see `camera::Rectification`.
+
+override WIDTH: u32;
+override HEIGHT: u32;
+
+struct Rectification {
+    // 1 / fx, 1 / fy, cx, cy of the canonical camera
+    canonical: vec4<f32>,
+    // fx, fy, cx, cy of the source
+    source: vec4<f32>,
+    // size of the source in pixels
+    size: vec2<f32>,
+    // samples across the footprint, along canonical x and y
+    samples: vec2<u32>,
+    // rational: k1 .. k4; equidistant: k1 .. k4
+    k_low: vec4<f32>,
+    // rational: k5, k6, p1, p2
+    k_high: vec4<f32>,
+    // 0 none, 1 rational, 2 equidistant
+    model: u32,
+    // beyond this distance from the axis (at z = 1) the lens shows nothing
+    max_radius: f32,
+    // which image of the batch is written
+    index: u32,
+}
+
+@group(0) @binding(0) var source: texture_2d<f32>;
+@group(0) @binding(1) var<uniform> params: Rectification;
+// [image][row][column] of vec4, the last lane zero
+@group(0) @binding(2) var<storage, read_write> output: array<vec4<f32>>;
+
+// Where a ray at z = 1 lands in the source, in pixels.
+fn project(ray: vec2<f32>) -> vec2<f32> {
+    let r2 = dot(ray, ray);
+    var bent = ray;
+    if params.model == 1u {
+        let k = params.k_low;
+        let radial = (1.0 + r2 * (k.x + r2 * (k.y + r2 * k.z)))
+            / (1.0 + r2 * (k.w + r2 * (params.k_high.x + r2 * params.k_high.y)));
+        let p = params.k_high.zw;
+        let xy = 2.0 * ray.x * ray.y;
+        bent = ray * radial + vec2(
+            p.x * xy + p.y * (r2 + 2.0 * ray.x * ray.x),
+            p.x * (r2 + 2.0 * ray.y * ray.y) + p.y * xy,
+        );
+    } else if params.model == 2u {
+        let r = sqrt(r2);
+        let theta = atan(r);
+        let t2 = theta * theta;
+        let k = params.k_low;
+        let bent_theta = theta * (1.0 + t2 * (k.x + t2 * (k.y + t2 * (k.z + t2 * k.w))));
+        // On the axis the ratio tends to 1.
+        bent = ray * select(1.0, bent_theta / r, r > 1e-6);
+    }
+    return bent * params.source.xy + params.source.zw;
+}
+
+fn ray_of(pixel: vec2<f32>) -> vec2<f32> {
+    return (pixel - params.canonical.zw) * params.canonical.xy;
+}
+
+fn load(at: vec2<i32>) -> vec3<f32> {
+    let inside = all(at >= vec2(0)) && all(at < vec2<i32>(params.size));
+    return select(vec3(0.0), textureLoad(source, clamp(at, vec2(0), vec2<i32>(params.size) - 1), 0).rgb, inside);
+}
+
+// Bilinear, as if black pixels lay round the source: without a step at its border.
+fn sample(at: vec2<f32>) -> vec3<f32> {
+    if !(all(at > vec2(-1.0)) && all(at < params.size)) {
+        return vec3(0.0);
+    }
+    let corner = vec2<i32>(floor(at));
+    let part = at - floor(at);
+    let top = mix(load(corner), load(corner + vec2(1, 0)), part.x);
+    let bottom = mix(load(corner + vec2(0, 1)), load(corner + vec2(1, 1)), part.x);
+    return mix(top, bottom, part.y);
+}
+
+@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let index = (group.y * groups.x + group.x) * 64u + local;
+    if index >= WIDTH * HEIGHT {
+        return;
+    }
+    let pixel = vec2(f32(index % WIDTH), f32(index / WIDTH));
+    var colour = vec3(0.0);
+    let ray = ray_of(pixel);
+    if dot(ray, ray) <= params.max_radius * params.max_radius {
+        let centre = project(ray);
+        let along_x = project(ray_of(pixel + vec2(0.5, 0.0))) - project(ray_of(pixel - vec2(0.5, 0.0)));
+        let along_y = project(ray_of(pixel + vec2(0.0, 0.5))) - project(ray_of(pixel - vec2(0.0, 0.5)));
+        let step = 1.0 / vec2<f32>(params.samples);
+        for (var j = 0u; j < params.samples.y; j++) {
+            for (var i = 0u; i < params.samples.x; i++) {
+                let part = (vec2(f32(i), f32(j)) + 0.5) * step - 0.5;
+                colour += sample(centre + along_x * part.x + along_y * part.y);
+            }
+        }
+        colour *= step.x * step.y;
+    }
+    output[params.index * WIDTH * HEIGHT + index] = vec4(colour, 0.0);
+}

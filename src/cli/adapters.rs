@@ -1,0 +1,120 @@
+//! `whereabot adapters`: what there is to run on.
+
+use std::io::{self, Write};
+use std::process::ExitCode;
+
+use serde_json::json;
+
+use crate::gpu::{AdapterReport, AdapterRequest, Choice, GpuError, list_adapters};
+
+/// List the graphics adapters, and say which one `locate` would use and why
+///
+/// WGPU_BACKEND (vulkan, metal, dx12, gl) and WGPU_ADAPTER_NAME are honoured.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// One JSON object instead of a table
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let (reports, choice) = list_adapters(&AdapterRequest::new(None, None))?;
+    let text = if args.json {
+        format!("{:#}\n", as_json(&reports, &choice))
+    } else {
+        as_table(&reports, &choice)
+    };
+    io::stdout().lock().write_all(text.as_bytes())?;
+    match choice {
+        Ok(_) | Err(GpuError::NoAdapter { .. }) => Ok(ExitCode::SUCCESS),
+        Err(error) => Err(error.into()),
+    }
+}
+
+fn as_json(reports: &[AdapterReport], choice: &Result<Choice, GpuError>) -> serde_json::Value {
+    let adapters: Vec<_> = reports
+        .iter()
+        .enumerate()
+        .map(|(index, report)| {
+            let mut adapter = json!({
+                "index": index,
+                "name": report.info.name,
+                "type": device_type(report),
+                "backend": report.info.backend.to_str(),
+                "driver": driver(report),
+                "tier": report.tier.to_string(),
+                "usable": report.unusable.is_none(),
+            });
+            if let Some(problem) = &report.unusable {
+                adapter["problem"] = json!(problem);
+            }
+            adapter
+        })
+        .collect();
+    let mut answer = json!({"schema": 1, "adapters": adapters});
+    match choice {
+        Ok(choice) => answer["used"] = json!({"index": choice.index, "reason": choice.reason}),
+        Err(error) => answer["problem"] = json!(error.to_string()),
+    }
+    answer
+}
+
+fn as_table(reports: &[AdapterReport], choice: &Result<Choice, GpuError>) -> String {
+    let mut rows =
+        vec![["", "NAME", "TYPE", "BACKEND", "DRIVER", "TIER", "USABLE"].map(String::from)];
+    rows.extend(reports.iter().enumerate().map(|(index, report)| {
+        [
+            index.to_string(),
+            report.info.name.clone(),
+            device_type(report).to_owned(),
+            report.info.backend.to_str().to_owned(),
+            driver(report),
+            report.tier.to_string(),
+            report
+                .unusable
+                .as_ref()
+                .map_or("yes".to_owned(), |problem| format!("no: {problem}")),
+        ]
+    }));
+    let mut widths = [0; 7];
+    for row in &rows {
+        for (width, cell) in widths.iter_mut().zip(row) {
+            *width = cell.chars().count().max(*width);
+        }
+    }
+    let mut text = String::new();
+    for row in &rows {
+        let cells: Vec<_> = row
+            .iter()
+            .zip(widths)
+            .map(|(cell, width)| format!("{cell:width$}"))
+            .collect();
+        text += cells.join("  ").trim_end();
+        text.push('\n');
+    }
+    text += &match choice {
+        Ok(choice) => format!("\nused: {} ({})\n", choice.index, choice.reason),
+        Err(error @ GpuError::NoAdapter { .. }) => {
+            format!("\nused: the CPU (plain Rust, slower), because of: {error}\n")
+        }
+        Err(_) => "\nused: none\n".to_owned(),
+    };
+    text
+}
+
+fn device_type(report: &AdapterReport) -> &'static str {
+    match report.info.device_type {
+        wgpu::DeviceType::DiscreteGpu => "discrete GPU",
+        wgpu::DeviceType::IntegratedGpu => "integrated GPU",
+        wgpu::DeviceType::VirtualGpu => "virtual GPU",
+        wgpu::DeviceType::Cpu => "CPU",
+        wgpu::DeviceType::Other => "other",
+    }
+}
+
+fn driver(report: &AdapterReport) -> String {
+    format!("{} {}", report.info.driver, report.info.driver_info)
+        .trim()
+        .to_owned()
+}

@@ -1,0 +1,180 @@
+//! `whereabot info`: a model file's card.
+
+use std::fmt::Write as _;
+use std::io::{self, Write};
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Context;
+use safetensors::SafeTensors;
+use serde_json::Value;
+
+use crate::network::{Activation, Model, Network, Operation, Overlay};
+
+/// Show what a model file holds: layers, sizes, training data, figures
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// The model file (safetensors)
+    file: PathBuf,
+    /// The description in the file, as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs the command.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let bytes = std::fs::read(&args.file).with_context(|| args.file.display().to_string())?;
+    let model = Model::from_bytes(&bytes, &args.file)?;
+    let text = if args.json {
+        let (_, header) = SafeTensors::read_metadata(&bytes)?;
+        let description = header
+            .metadata()
+            .as_ref()
+            .and_then(|metadata| metadata.get(Model::METADATA_KEY))
+            .context("a model without a description")?;
+        let description: Value = serde_json::from_str(description)?;
+        format!("{description:#}\n")
+    } else {
+        card(&model, bytes.len())
+    };
+    io::stdout().lock().write_all(text.as_bytes())?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn card(model: &Model, file_size: usize) -> String {
+    let description = &model.description;
+    let networks = [
+        ("mask network", &model.mask_network),
+        ("joint network", &model.joint_network),
+    ];
+    let macs: u64 = networks.iter().map(|(_, network)| network.macs()).sum();
+    let parameters: usize = networks
+        .iter()
+        .map(|(_, network)| network.parameter_count())
+        .sum();
+    let overlay = match description.overlay {
+        Overlay::Multiply {} => "colour times mask".to_owned(),
+        Overlay::Threshold { threshold } => {
+            format!("colour where the mask is at least {threshold}")
+        }
+    };
+    let camera = description.camera;
+    let mut text = format!(
+        "robot       {}\n\
+         family      {}\n\
+         joints      {}\n\
+         input       {} x {} pixels, fx {} fy {} cx {} cy {}\n\
+         overlay     {overlay}\n\
+         presence    mask of at least {} on {} % of the input\n\
+         size        {} MMAC an image, {parameters} parameters, {} KiB\n",
+        description.robot,
+        description.family,
+        description.joints.join(", "),
+        description.input.width,
+        description.input.height,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        description.presence.mask_threshold,
+        100.0 * description.presence.min_coverage,
+        millions(macs),
+        file_size / 1024,
+    );
+    for (name, network) in networks {
+        text += &layers(name, network);
+    }
+    if let Some(entries) = description.card.as_object().filter(|card| !card.is_empty()) {
+        text += "\ncard\n";
+        for (key, value) in entries {
+            outline(&mut text, key, value, 1);
+        }
+    }
+    text
+}
+
+fn layers(name: &str, network: &Network) -> String {
+    let mut text = format!(
+        "\n{name}: {} to {}, {} MMAC, {} parameters\n",
+        network.input(),
+        network.output(),
+        millions(network.macs()),
+        network.parameter_count(),
+    );
+    for node in network.nodes() {
+        let layer = &node.layer;
+        let parameters = node
+            .parameters
+            .as_ref()
+            .map_or(0, |p| p.weight.len() + p.bias.len());
+        // Writing to a string cannot fail.
+        let _ = writeln!(
+            text,
+            "  {:10} {:10} {:32} of {:16} {:16} {:>9} MMAC {:>9} parameters",
+            layer.name,
+            layer.operation.name(),
+            options(&layer.operation),
+            layer.inputs.join(", "),
+            node.output.to_string(),
+            millions(layer.operation.macs(node.input)),
+            parameters,
+        );
+    }
+    text
+}
+
+fn options(operation: &Operation) -> String {
+    let activation = |activation: &Activation| match activation {
+        Activation::None => "",
+        Activation::Relu => ", relu",
+        Activation::Sigmoid => ", sigmoid",
+    };
+    match operation {
+        Operation::Conv2d {
+            kernel,
+            dilation,
+            activation: a,
+            ..
+        } => format!("{kernel} x {kernel}, dilation {dilation}{}", activation(a)),
+        Operation::MaxPool2d { size } => format!("{size} x {size}"),
+        Operation::Dense {
+            out_features,
+            activation: a,
+        } => format!("to {out_features}{}", activation(a)),
+        Operation::Upsample2d { scale } => format!("x {scale}"),
+        Operation::Sigmoid | Operation::Concat => String::new(),
+    }
+}
+
+fn millions(count: u64) -> String {
+    format!("{:.2}", count as f64 / 1e6)
+}
+
+/// A JSON value as indented `key: value` lines.
+fn outline(text: &mut String, key: &str, value: &Value, depth: usize) {
+    let indent = "  ".repeat(depth);
+    let scalar = |value: &Value| match value {
+        Value::String(s) => s.clone(),
+        other => other.to_string(),
+    };
+    let nested = |value: &Value| value.is_object() || value.is_array();
+    match value {
+        Value::Object(entries) => {
+            *text += &format!("{indent}{key}:\n");
+            for (key, value) in entries {
+                outline(text, key, value, depth + 1);
+            }
+        }
+        Value::Array(items) if items.iter().any(nested) => {
+            *text += &format!("{indent}{key}:\n");
+            for item in items {
+                outline(text, "-", item, depth + 1);
+            }
+        }
+        Value::Array(items) => {
+            let items: Vec<_> = items.iter().map(scalar).collect();
+            *text += &format!("{indent}{key}: {}\n", items.join(", "));
+        }
+        other => *text += &format!("{indent}{key}: {}\n", scalar(other)),
+    }
+}

@@ -1,0 +1,343 @@
+use wgpu::{AdapterInfo, Backend, Backends, DeviceType};
+
+use super::GpuError;
+use super::device::Tier;
+
+/// Which adapter is wanted. A flag goes before the environment, the environment before the rule
+/// (the best real GPU).
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct AdapterRequest {
+    /// Index in [`list_adapters`], or a part of the adapter's name in any case.
+    pub adapter: Option<Wanted>,
+    /// Backends to search; all when `None`.
+    pub backends: Option<Wanted>,
+}
+
+/// A wish, and who has it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Wanted {
+    value: String,
+    origin: &'static str,
+}
+
+impl AdapterRequest {
+    /// Reads `WGPU_ADAPTER_NAME` and `WGPU_BACKEND` for what the flags leave open.
+    pub fn new(adapter_flag: Option<&str>, backend_flag: Option<&str>) -> Self {
+        let wanted = |flag: Option<&str>, flag_name, variable: &'static str| {
+            let from = |value: &str, origin| Wanted {
+                value: value.trim().to_owned(),
+                origin,
+            };
+            flag.map(|value| from(value, flag_name)).or_else(|| {
+                std::env::var(variable)
+                    .ok()
+                    .filter(|value| !value.trim().is_empty())
+                    .map(|value| from(&value, variable))
+            })
+        };
+        Self {
+            adapter: wanted(adapter_flag, "--adapter", "WGPU_ADAPTER_NAME"),
+            backends: wanted(backend_flag, "--backend", "WGPU_BACKEND"),
+        }
+    }
+
+    /// The backends to search.
+    ///
+    /// # Errors
+    /// [`GpuError::UnknownBackend`].
+    pub(super) fn backends(&self) -> Result<Backends, GpuError> {
+        let Some(wanted) = &self.backends else {
+            return Ok(Backends::PRIMARY | Backends::SECONDARY);
+        };
+        wanted
+            .value
+            .split(',')
+            .map(|name| match name.trim().to_lowercase().as_str() {
+                "vulkan" | "vk" => Ok(Backends::VULKAN),
+                "metal" | "mtl" => Ok(Backends::METAL),
+                "dx12" | "d3d12" => Ok(Backends::DX12),
+                "gl" | "gles" | "opengl" => Ok(Backends::GL),
+                _ => Err(GpuError::UnknownBackend {
+                    wanted: name.trim().to_owned(),
+                    origin: wanted.origin,
+                }),
+            })
+            .try_fold(Backends::empty(), |all, one| Ok(all | one?))
+    }
+}
+
+/// An adapter as `whereabot adapters` shows it.
+#[derive(Debug, Clone)]
+pub struct AdapterReport {
+    /// Name, type, backend and driver.
+    pub info: AdapterInfo,
+    /// What its kernels can use.
+    pub tier: Tier,
+    /// Why it cannot be used, if it cannot.
+    pub unusable: Option<String>,
+}
+
+impl AdapterReport {
+    fn of(adapter: &wgpu::Adapter) -> Self {
+        let limits = adapter.limits();
+        let compute = adapter
+            .get_downlevel_capabilities()
+            .flags
+            .contains(wgpu::DownlevelFlags::COMPUTE_SHADERS);
+        // What WebGPU guarantees, and the kernels count on.
+        let least = wgpu::Limits::defaults();
+        let unusable = if !compute {
+            Some("no compute shaders".to_owned())
+        } else if limits.max_storage_buffers_per_shader_stage < 4 {
+            Some(format!(
+                "{} storage buffers a shader, 4 needed",
+                limits.max_storage_buffers_per_shader_stage
+            ))
+        } else if limits.max_compute_invocations_per_workgroup
+            < least.max_compute_invocations_per_workgroup
+        {
+            Some(format!(
+                "{} invocations a workgroup, {} needed",
+                limits.max_compute_invocations_per_workgroup,
+                least.max_compute_invocations_per_workgroup
+            ))
+        } else {
+            None
+        };
+        Self {
+            info: adapter.get_info(),
+            tier: Tier::of(adapter.features()),
+            unusable,
+        }
+    }
+}
+
+/// Which adapter is used, and why.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Choice {
+    /// Index in [`list_adapters`].
+    pub index: usize,
+    /// The reason, for people.
+    pub reason: String,
+}
+
+/// All adapters of the backends asked for, and the one that would be used (or why there is none).
+///
+/// # Errors
+/// [`GpuError::UnknownBackend`].
+#[allow(clippy::type_complexity)]
+pub fn list_adapters(
+    request: &AdapterRequest,
+) -> Result<(Vec<AdapterReport>, Result<Choice, GpuError>), GpuError> {
+    let (_, adapters) = enumerate(request.backends()?);
+    let reports: Vec<_> = adapters.iter().map(AdapterReport::of).collect();
+    let choice = choose(&reports, request);
+    Ok((reports, choice))
+}
+
+/// The adapter that `request` leads to.
+pub(super) fn open(
+    request: &AdapterRequest,
+) -> Result<(wgpu::Instance, wgpu::Adapter, Choice), GpuError> {
+    let backends = request.backends()?;
+    // Without a wish, GL is looked at only where there is nothing better: opening it is slow, and
+    // noisy on a machine without a display.
+    if *request == AdapterRequest::default()
+        && let Ok(found) = open_among(Backends::PRIMARY, request)
+    {
+        return Ok(found);
+    }
+    open_among(backends, request)
+}
+
+fn open_among(
+    backends: Backends,
+    request: &AdapterRequest,
+) -> Result<(wgpu::Instance, wgpu::Adapter, Choice), GpuError> {
+    let (instance, mut adapters) = enumerate(backends);
+    let reports: Vec<_> = adapters.iter().map(AdapterReport::of).collect();
+    let choice = choose(&reports, request)?;
+    Ok((instance, adapters.swap_remove(choice.index), choice))
+}
+
+fn enumerate(backends: Backends) -> (wgpu::Instance, Vec<wgpu::Adapter>) {
+    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
+        backends,
+        ..wgpu::InstanceDescriptor::new_without_display_handle()
+    });
+    let adapters = pollster::block_on(instance.enumerate_adapters(backends));
+    (instance, adapters)
+}
+
+fn choose(reports: &[AdapterReport], request: &AdapterRequest) -> Result<Choice, GpuError> {
+    let backends = || match &request.backends {
+        Some(wanted) => wanted.value.clone(),
+        None => "all".into(),
+    };
+    let Some(wanted) = &request.adapter else {
+        return reports
+            .iter()
+            .enumerate()
+            .filter(|(_, report)| report.unusable.is_none())
+            // The first of the best: `max_by_key` would give the last.
+            .min_by_key(|(_, report)| std::cmp::Reverse(rank(&report.info)))
+            .map(|(index, report)| Choice {
+                index,
+                reason: format!(
+                    "best of {} found: {}",
+                    reports.len(),
+                    device_type(report.info.device_type)
+                ),
+            })
+            .ok_or_else(|| GpuError::NoAdapter {
+                backends: backends(),
+            });
+    };
+    let reason = format!("{} = {}", wanted.origin, wanted.value);
+    let name = wanted.value.to_lowercase();
+    let by_index = name.parse().ok().filter(|&index| index < reports.len());
+    let by_name = || {
+        reports
+            .iter()
+            .position(|report| report.info.name.to_lowercase().contains(&name))
+    };
+    let unknown = || GpuError::UnknownAdapter {
+        wanted: wanted.value.clone(),
+        origin: wanted.origin,
+        available: reports
+            .iter()
+            .enumerate()
+            .map(|(i, report)| format!("{i}: {} ({})", report.info.name, report.info.backend))
+            .collect(),
+    };
+    let index = by_index.or_else(by_name).ok_or_else(unknown)?;
+    match reports.get(index).map(|report| &report.unusable) {
+        Some(Some(problem)) => Err(GpuError::Request {
+            adapter: wanted.value.clone(),
+            reason: problem.clone(),
+        }),
+        _ => Ok(Choice { index, reason }),
+    }
+}
+
+/// Real GPUs first, and native backends before GL.
+fn rank(info: &AdapterInfo) -> (u8, u8) {
+    let kind = match info.device_type {
+        DeviceType::DiscreteGpu => 4,
+        DeviceType::IntegratedGpu => 3,
+        DeviceType::VirtualGpu => 2,
+        DeviceType::Other => 1,
+        DeviceType::Cpu => 0,
+    };
+    let backend = match info.backend {
+        Backend::Vulkan | Backend::Metal | Backend::Dx12 => 2,
+        Backend::BrowserWebGpu => 1,
+        _ => 0,
+    };
+    (kind, backend)
+}
+
+fn device_type(kind: DeviceType) -> &'static str {
+    match kind {
+        DeviceType::DiscreteGpu => "a discrete GPU",
+        DeviceType::IntegratedGpu => "an integrated GPU",
+        DeviceType::VirtualGpu => "a virtual GPU",
+        DeviceType::Cpu => "a CPU rasteriser",
+        DeviceType::Other => "of unknown type",
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::panic)]
+mod tests {
+    use super::*;
+
+    fn report(name: &str, device_type: DeviceType, backend: Backend) -> AdapterReport {
+        AdapterReport {
+            info: AdapterInfo {
+                name: name.into(),
+                ..AdapterInfo::new(device_type, backend)
+            },
+            tier: Tier::Baseline,
+            unusable: None,
+        }
+    }
+
+    fn three() -> Vec<AdapterReport> {
+        vec![
+            report("llvmpipe", DeviceType::Cpu, Backend::Vulkan),
+            report("Card", DeviceType::DiscreteGpu, Backend::Gl),
+            report("Card", DeviceType::DiscreteGpu, Backend::Vulkan),
+        ]
+    }
+
+    fn wants(adapter: &str) -> AdapterRequest {
+        AdapterRequest {
+            adapter: Some(Wanted {
+                value: adapter.into(),
+                origin: "--adapter",
+            }),
+            backends: None,
+        }
+    }
+
+    #[test]
+    fn the_best_real_gpu_is_chosen_on_its_native_backend() {
+        let choice = choose(&three(), &AdapterRequest::default()).unwrap();
+        assert_eq!(choice.index, 2);
+    }
+
+    #[test]
+    fn an_unusable_adapter_is_passed_over() {
+        let mut reports = three();
+        reports[2].unusable = Some("no compute shaders".into());
+        assert_eq!(
+            choose(&reports, &AdapterRequest::default()).unwrap().index,
+            1
+        );
+    }
+
+    #[test]
+    fn a_name_in_any_case_or_an_index_is_found() {
+        assert_eq!(choose(&three(), &wants("LLVM")).unwrap().index, 0);
+        assert_eq!(choose(&three(), &wants("1")).unwrap().index, 1);
+    }
+
+    #[test]
+    fn an_unknown_name_lists_what_there_is() {
+        let error = choose(&three(), &wants("radeon")).unwrap_err().to_string();
+        assert!(error.contains("radeon") && error.contains("--adapter"));
+        assert!(error.contains("0: llvmpipe (vulkan)"), "{error}");
+    }
+
+    #[test]
+    fn an_index_beyond_the_list_is_unknown() {
+        assert!(matches!(
+            choose(&three(), &wants("3")),
+            Err(GpuError::UnknownAdapter { .. })
+        ));
+    }
+
+    #[test]
+    fn no_adapter_is_an_error() {
+        assert!(matches!(
+            choose(&[], &AdapterRequest::default()),
+            Err(GpuError::NoAdapter { .. })
+        ));
+    }
+
+    #[test]
+    fn an_unknown_backend_is_an_error() {
+        let request = AdapterRequest {
+            adapter: None,
+            backends: Some(Wanted {
+                value: "vulkan,glide".into(),
+                origin: "--backend",
+            }),
+        };
+        assert!(matches!(
+            request.backends(),
+            Err(GpuError::UnknownBackend { wanted, .. }) if wanted == "glide"
+        ));
+    }
+}

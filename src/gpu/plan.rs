@@ -1,0 +1,175 @@
+use image::RgbaImage;
+
+use super::coverage::{Totals, coverage};
+use super::overlay::overlay;
+use super::rectify::Rectify;
+use super::step::Step;
+use super::tensor::{Tensor, blocks, staging_buffer, storage_buffer, unpack};
+use super::{Device, GpuError, NetworkPlan};
+use crate::camera::Rectification;
+use crate::network::{Coverage, Model};
+
+/// The whole cascade planned for a batch of images: rectify, mask network, coverage, overlay, joint
+/// network. Everything is allocated, compiled and bound once; a frame is one submission and one
+/// small readback.
+#[derive(Debug)]
+pub struct Plan {
+    image: Tensor,
+    rectify: Vec<Rectify>,
+    mask: NetworkPlan,
+    coverage: Step,
+    totals: wgpu::Buffer,
+    overlay: Step,
+    joint: NetworkPlan,
+    joint_values: usize,
+    results: wgpu::Buffer,
+    masks: wgpu::Buffer,
+}
+
+/// What the networks made of one image.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Frame {
+    /// The mask's extent, in pixels of the network's image.
+    pub coverage: Coverage,
+    /// The joint network's output: `x, y, z` a joint, in metres. Empty where only the mask was asked for.
+    pub joints: Vec<f32>,
+    /// The mask `[row][column]`, in [0, 1]. Empty unless asked for.
+    pub mask: Vec<f32>,
+}
+
+impl Plan {
+    /// Plans `model` for `batch` images a frame.
+    ///
+    /// # Errors
+    /// A layer that exceeds the adapter's limits, or a driver's refusal.
+    pub fn new(device: &Device, model: &Model, batch: usize) -> Result<Self, GpuError> {
+        let description = &model.description;
+        let shape = model.mask_network.input();
+        device.scoped(|| {
+            let image = Tensor::new(device, "image", shape, batch)?;
+            let rectify = (0..batch)
+                .map(|_| Rectify::new(device, &image))
+                .collect::<Result<_, _>>()?;
+            let mask = NetworkPlan::new(device, "mask", &model.mask_network, &image)?;
+            let masked = Tensor::new(device, "overlay", shape, batch)?;
+            let joint = NetworkPlan::new(device, "joint", &model.joint_network, &masked)?;
+            let totals = storage_buffer(
+                device,
+                "coverage: totals",
+                (batch * size_of::<Totals>()) as u64,
+            )?;
+            let output = mask.output();
+            let coverage = coverage(device, output, &totals, description.presence.mask_threshold)?;
+            let overlay = overlay(device, &image, output, &masked, description.overlay)?;
+            let results = staging_buffer(device, totals.size() + joint.output().buffer.size());
+            let masks = staging_buffer(device, output.buffer.size());
+            Ok(Self {
+                image,
+                rectify,
+                coverage,
+                totals,
+                overlay,
+                joint_values: model.joint_network.output().len(),
+                results,
+                masks,
+                mask,
+                joint,
+            })
+        })
+    }
+
+    /// Gives image `index` of the next frame: `source`, and how it becomes the canonical image.
+    ///
+    /// # Errors
+    /// An `index` beyond the batch, an image beyond the adapter's limits, too little memory.
+    pub fn write(
+        &mut self,
+        device: &Device,
+        index: usize,
+        source: &RgbaImage,
+        rectification: &Rectification,
+    ) -> Result<(), GpuError> {
+        let batch = self.rectify.len();
+        let slot = self.rectify.get_mut(index).ok_or(GpuError::Size {
+            what: "batch index",
+            expected: batch,
+            found: index,
+        })?;
+        let params = Rectification {
+            index: index as u32,
+            ..*rectification
+        };
+        slot.write(device, &self.image, source, &params)
+    }
+
+    /// Runs a frame and waits for it: the result of each image of the batch. The masks are read back
+    /// only `with_mask`, the joint network runs only `with_joints`.
+    ///
+    /// # Errors
+    /// As [`Device::wait`].
+    pub fn run(
+        &self,
+        device: &Device,
+        with_joints: bool,
+        with_mask: bool,
+    ) -> Result<Vec<Frame>, GpuError> {
+        let mut encoder = device.wgpu().create_command_encoder(&Default::default());
+        encoder.clear_buffer(&self.totals, 0, None);
+        let mut pass = encoder.begin_compute_pass(&Default::default());
+        for rectify in &self.rectify {
+            rectify.encode(&mut pass);
+        }
+        self.mask.encode(&mut pass);
+        self.coverage.encode(&mut pass);
+        if with_joints {
+            self.overlay.encode(&mut pass);
+            self.joint.encode(&mut pass);
+        }
+        drop(pass);
+        let joints = &self.joint.output().buffer;
+        let masks = &self.mask.output().buffer;
+        let totals = self.totals.size();
+        encoder.copy_buffer_to_buffer(&self.totals, 0, &self.results, 0, totals);
+        if with_joints {
+            encoder.copy_buffer_to_buffer(joints, 0, &self.results, totals, joints.size());
+        }
+        if with_mask {
+            encoder.copy_buffer_to_buffer(masks, 0, &self.masks, 0, masks.size());
+        }
+        device.queue().submit([encoder.finish()]);
+
+        let shape = self.image.shape;
+        let (width, height) = (shape.width as u32, shape.height as u32);
+        let (totals_size, joints_size) = (size_of::<Totals>(), 16 * blocks(self.joint_values));
+        let mut frames = device.read(&self.results, |bytes| {
+            let (all_totals, all_joints) = bytes.split_at(totals as usize);
+            all_totals
+                .chunks_exact(totals_size)
+                .zip(all_joints.chunks_exact(joints_size))
+                .map(|(totals, joints)| {
+                    let mut joints = bytemuck::pod_collect_to_vec::<u8, f32>(joints);
+                    joints.truncate(if with_joints { self.joint_values } else { 0 });
+                    Frame {
+                        coverage: bytemuck::pod_read_unaligned::<Totals>(totals)
+                            .coverage(width, height),
+                        joints,
+                        mask: Vec::new(),
+                    }
+                })
+                .collect::<Vec<_>>()
+        })?;
+        if with_mask {
+            let values = device.read(&self.masks, |bytes| {
+                unpack(
+                    &bytemuck::pod_collect_to_vec(bytes),
+                    self.mask.output().shape,
+                )
+            })?;
+            let plane = shape.height * shape.width;
+            for (frame, mask) in frames.iter_mut().zip(values.chunks_exact(plane)) {
+                frame.mask = mask.to_vec();
+            }
+        }
+        Ok(frames)
+    }
+}

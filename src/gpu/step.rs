@@ -1,0 +1,113 @@
+use super::{Device, GpuError};
+
+/// One dispatch of a kernel: all that encoding it needs, made once.
+#[derive(Debug)]
+pub struct Step {
+    pipeline: wgpu::ComputePipeline,
+    bind_group: wgpu::BindGroup,
+    workgroups: [u32; 2],
+}
+
+/// What a step is made of.
+pub(super) struct StepDescriptor<'a> {
+    /// Names the step in profilers and driver messages.
+    pub label: &'a str,
+    /// The kernel's WGSL.
+    pub source: &'a str,
+    /// Its entry point.
+    pub entry_point: &'a str,
+    /// Values of its `override` constants.
+    pub constants: &'a [(&'a str, f64)],
+    /// What it binds, as (binding, resource).
+    pub bindings: &'a [(u32, wgpu::BindingResource<'a>)],
+    /// Number of workgroups. The kernel works out its index as `y * num_workgroups.x + x`, and
+    /// passes over indices beyond its work.
+    pub workgroups: usize,
+}
+
+impl Step {
+    /// Compiles the kernel and binds its resources. Driver errors reach the caller's
+    /// [`Device::scoped`].
+    pub(super) fn new(device: &Device, step: &StepDescriptor<'_>) -> Result<Self, GpuError> {
+        let module = device
+            .wgpu()
+            .create_shader_module(wgpu::ShaderModuleDescriptor {
+                label: Some(step.label),
+                source: wgpu::ShaderSource::Wgsl(step.source.into()),
+            });
+        let pipeline = device
+            .wgpu()
+            .create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+                label: Some(step.label),
+                layout: None,
+                module: &module,
+                entry_point: Some(step.entry_point),
+                compilation_options: wgpu::PipelineCompilationOptions {
+                    constants: step.constants,
+                    ..Default::default()
+                },
+                cache: None,
+            });
+        let bind_group = bind(device, &pipeline, step.bindings);
+        // A dimension holds 65,535 workgroups at most: long dispatches are folded into rows.
+        let row = device.wgpu().limits().max_compute_workgroups_per_dimension as usize;
+        let x = step.workgroups.clamp(1, row);
+        let y = step.workgroups.div_ceil(x).max(1);
+        device.require(
+            &format!("{}: workgroups", step.label),
+            step.workgroups as u64,
+            (row * row) as u64,
+        )?;
+        Ok(Self {
+            pipeline,
+            bind_group,
+            workgroups: [x as u32, y as u32],
+        })
+    }
+
+    /// Binds other resources to the same kernel.
+    pub(super) fn rebind(
+        &mut self,
+        device: &Device,
+        bindings: &[(u32, wgpu::BindingResource<'_>)],
+    ) {
+        self.bind_group = bind(device, &self.pipeline, bindings);
+    }
+
+    /// Records the dispatch.
+    pub fn encode(&self, pass: &mut wgpu::ComputePass<'_>) {
+        pass.set_pipeline(&self.pipeline);
+        pass.set_bind_group(0, &self.bind_group, &[]);
+        let [x, y] = self.workgroups;
+        pass.dispatch_workgroups(x, y, 1);
+    }
+}
+
+fn bind(
+    device: &Device,
+    pipeline: &wgpu::ComputePipeline,
+    bindings: &[(u32, wgpu::BindingResource<'_>)],
+) -> wgpu::BindGroup {
+    let entries: Vec<_> = bindings
+        .iter()
+        .map(|(binding, resource)| wgpu::BindGroupEntry {
+            binding: *binding,
+            resource: resource.clone(),
+        })
+        .collect();
+    device.wgpu().create_bind_group(&wgpu::BindGroupDescriptor {
+        label: None,
+        layout: &pipeline.get_bind_group_layout(0),
+        entries: &entries,
+    })
+}
+
+/// The number that stands for an activation in the kernels' `ACTIVATION` constant.
+pub(super) fn activation_constant(activation: crate::network::Activation) -> f64 {
+    use crate::network::Activation;
+    match activation {
+        Activation::None => 0.0,
+        Activation::Relu => 1.0,
+        Activation::Sigmoid => 2.0,
+    }
+}

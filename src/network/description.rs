@@ -1,0 +1,149 @@
+use serde::{Deserialize, Serialize};
+
+use super::{Layer, NetworkError};
+use crate::camera::Intrinsics;
+
+/// Everything about a model that is not a tensor: the JSON under the key `whereabot` of a model
+/// file's metadata.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Description {
+    /// Version of this description; [`Description::VERSION`] is the one understood here.
+    pub version: u32,
+    /// Family of the networks: `paper` for the shape published in the paper.
+    pub family: String,
+    /// The robot that the model was trained to find, such as `ur5`.
+    pub robot: String,
+    /// Names of the joints in the order of the joint network's output.
+    pub joints: Vec<String>,
+    /// Size of the image that both networks take.
+    pub input: InputSize,
+    /// The pinhole camera that the networks were trained on, in pixels of `input`.
+    pub camera: Intrinsics,
+    /// From colour `[3, height, width]` to the robot's mask `[1, height, width]` (paper, section III).
+    pub mask_network: NetworkDescription,
+    /// How mask and colour make the joint network's input.
+    pub overlay: Overlay,
+    /// From the overlay `[3, height, width]` to `x, y, z` of each joint, in metres, in the camera
+    /// optical frame.
+    pub joint_network: NetworkDescription,
+    /// When a mask means that there is a robot.
+    pub presence: Presence,
+    /// The model card: data, protocol, figures. Free in form.
+    #[serde(default)]
+    pub card: serde_json::Value,
+}
+
+/// Size of an image, in pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct InputSize {
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+}
+
+/// The layers of one network.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NetworkDescription {
+    /// In the order in which they run; the last one is the output.
+    pub layers: Vec<Layer>,
+}
+
+/// How mask and colour make the joint network's input.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "rule", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Overlay {
+    /// Colour times the mask's probability.
+    Multiply {},
+    /// Colour where the mask's probability is at least `threshold`, black elsewhere.
+    Threshold {
+        /// In (0, 1).
+        threshold: f32,
+    },
+}
+
+/// When a mask means that there is a robot.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Presence {
+    /// A pixel belongs to the robot from this probability on, in (0, 1).
+    pub mask_threshold: f32,
+    /// Smallest share of the image that must be robot, in [0, 1].
+    pub min_coverage: f32,
+}
+
+impl Description {
+    /// The version of the description that this library reads.
+    pub const VERSION: u32 = 1;
+
+    /// Checks what the types do not say.
+    pub(super) fn check(&self) -> Result<(), String> {
+        let Self {
+            camera: Intrinsics { fx, fy, cx, cy },
+            input: InputSize { width, height },
+            ..
+        } = *self;
+        if self.version != Self::VERSION {
+            return Err(format!(
+                "version: expected {}, found {}",
+                Self::VERSION,
+                self.version
+            ));
+        }
+        // Sides up to 8192 keep every index of an image 32-bit.
+        if !(1..=8192).contains(&width) || !(1..=8192).contains(&height) {
+            return Err(format!(
+                "input: expected sides of 1 to 8192 pixels, found {width} x {height}"
+            ));
+        }
+        if !(fx.is_finite() && fx > 0.0 && fy.is_finite() && fy > 0.0) {
+            return Err(format!(
+                "camera: expected positive focal lengths, found fx {fx}, fy {fy}"
+            ));
+        }
+        if !(cx.is_finite() && cy.is_finite()) {
+            return Err(format!(
+                "camera: expected a finite principal point, found cx {cx}, cy {cy}"
+            ));
+        }
+        if self.joints.is_empty() {
+            return Err("joints: expected at least one name, found none".into());
+        }
+        let inside = |what: &str, value: f32| {
+            if value > 0.0 && value < 1.0 {
+                Ok(())
+            } else {
+                Err(format!(
+                    "{what}: expected a number between 0 and 1, found {value}"
+                ))
+            }
+        };
+        inside("presence.mask_threshold", self.presence.mask_threshold)?;
+        if let Overlay::Threshold { threshold } = self.overlay {
+            inside("overlay.threshold", threshold)?;
+        }
+        if !(0.0..=1.0).contains(&self.presence.min_coverage) {
+            return Err(format!(
+                "presence.min_coverage: expected 0 to 1, found {}",
+                self.presence.min_coverage
+            ));
+        }
+        Ok(())
+    }
+}
+
+impl NetworkDescription {
+    /// Wraps an error with the network's name.
+    pub(super) fn named(name: &str, error: NetworkError) -> NetworkError {
+        match error {
+            NetworkError::Layer { layer, problem } => NetworkError::Layer {
+                layer: format!("{name}.{layer}"),
+                problem,
+            },
+            other => other,
+        }
+    }
+}

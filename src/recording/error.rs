@@ -1,0 +1,84 @@
+use std::path::PathBuf;
+
+use crate::gpu::GpuError;
+
+/// Why a recording could not be made, read or continued.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum RecordingError {
+    /// A file or folder could not be read or written.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The robot description is not one that the recorder can use.
+    #[error("{}: {message}", path.display())]
+    Urdf {
+        /// The URDF file.
+        path: PathBuf,
+        /// What was expected and what was found.
+        message: String,
+    },
+    /// A mesh that the robot description names is not there.
+    #[error("{}: link \"{link}\" wants the mesh \"{name}\", which was not found (looked for {})", urdf.display(), looked_for.display())]
+    MissingMesh {
+        /// The URDF file.
+        urdf: PathBuf,
+        /// The link that wants the mesh.
+        link: String,
+        /// The mesh's name as the URDF gives it.
+        name: String,
+        /// Where it was expected.
+        looked_for: PathBuf,
+    },
+    /// A mesh file could not be understood.
+    #[error("{}: {message}", path.display())]
+    Mesh {
+        /// The mesh file.
+        path: PathBuf,
+        /// What was expected and what was found.
+        message: String,
+    },
+    /// No picture in the folder could be used as a background.
+    #[error("{}: expected at least one readable JPEG or PNG picture, found none", path.display())]
+    NoBackgrounds {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// A background picture could not be decoded.
+    #[error("{}: {source}", path.display())]
+    Picture {
+        /// The picture.
+        path: PathBuf,
+        /// What the decoder said.
+        source: image::ImageError,
+    },
+    /// The output folder already holds something that this request does not continue.
+    #[error("{}: {message}", path.display())]
+    OutputTaken {
+        /// The file or folder in the way.
+        path: PathBuf,
+        /// What is in the way, and what to do.
+        message: String,
+    },
+    /// No scene that keeps the rules (camera, coverage, no collision) was found.
+    #[error("sample {id}: found no pose without collision that fills the picture as asked")]
+    NoScene {
+        /// The sample's number.
+        id: u64,
+    },
+    /// The GPU could not draw.
+    #[error(transparent)]
+    Gpu(#[from] GpuError),
+}
+
+impl RecordingError {
+    /// Attaches the path to an input or output error, for `map_err`.
+    pub(crate) fn io(path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.into();
+        move |source| Self::Io { path, source }
+    }
+}

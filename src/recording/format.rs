@@ -1,0 +1,231 @@
+//! A recording on disk: `recording.json`, `samples.jsonl`, `image/` and `mask/`.
+
+use std::fs::File;
+use std::io::{BufRead, BufReader, Write};
+use std::path::{Path, PathBuf};
+
+use image::codecs::jpeg::JpegEncoder;
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ExtendedColorType, ImageEncoder};
+use serde::{Deserialize, Serialize};
+
+use super::render::Picture;
+use super::{HEIGHT, RecordingError, WIDTH};
+use crate::camera::Intrinsics;
+
+/// `recording.json`: what all samples of a recording have in common.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Header {
+    /// Always `whereabot-recording`.
+    pub format: String,
+    /// Version of this format: 1.
+    pub version: u32,
+    /// The robot's name, for example `ur5`.
+    pub robot: String,
+    /// Joint names, base first.
+    pub joints: Vec<String>,
+    /// Width of all images, pixels.
+    pub width: u32,
+    /// Height of all images, pixels.
+    pub height: u32,
+    /// The frame of all positions: `camera_optical` (x right, y down, z forward).
+    pub frame: String,
+    /// Where the samples come from.
+    pub source: Source,
+}
+
+/// Where a recording comes from.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Source {
+    /// `synthetic`.
+    pub kind: String,
+    /// The program and its version.
+    pub generator: String,
+    /// The seed that the samples were drawn from.
+    pub seed: u64,
+    /// The robot description's file name.
+    pub urdf: String,
+    /// How camera and robot move.
+    pub protocol: Protocol,
+}
+
+/// How camera and robot move over a recording.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Protocol {
+    /// Each sample has a camera, a background, a light and a look of its own; some have no robot.
+    FreeCamera,
+    /// One camera and one look; the robot moves, backgrounds and light vary (the paper, section 3).
+    FixedCamera,
+}
+
+/// A line of `samples.jsonl`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Sample {
+    /// Number of the sample, from 0.
+    pub id: u64,
+    /// The colour image, relative to the recording's folder.
+    pub image: String,
+    /// The mask, relative to the recording's folder: 255 where the robot is visible, else 0.
+    pub mask: String,
+    /// The camera.
+    pub intrinsics: Intrinsics,
+    /// From the robot's base frame to the camera optical frame: 4x4, row by row.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub camera_from_base: Option<[f64; 16]>,
+    /// Joint angles, radians.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub joint_angles_rad: Option<Vec<f64>>,
+    /// Joint origins in the camera optical frame, metres.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub joints_m: Option<Vec<[f64; 3]>>,
+    /// Joint origins in the image, pixels, also where they lie outside it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub joints_px: Option<Vec<[f64; 2]>>,
+    /// The share of pixels whose mask is 255.
+    pub coverage: f64,
+}
+
+/// Writes a recording.
+pub struct Writer {
+    folder: PathBuf,
+    lines: File,
+    next: u64,
+}
+
+impl Writer {
+    /// Starts a recording in `folder`, or goes on with one whose header is the same after its last
+    /// complete line.
+    ///
+    /// # Errors
+    /// The folder holds another recording or other samples, or cannot be written.
+    pub fn open(folder: &Path, header: &Header) -> Result<Writer, RecordingError> {
+        let header_path = folder.join("recording.json");
+        let lines_path = folder.join("samples.jsonl");
+        let taken = |path: &Path, message: &str| RecordingError::OutputTaken {
+            path: path.to_owned(),
+            message: message.to_owned(),
+        };
+        for inside in ["image", "mask"] {
+            let inside = folder.join(inside);
+            std::fs::create_dir_all(&inside).map_err(RecordingError::io(&inside))?;
+        }
+        if header_path.exists() {
+            let text =
+                std::fs::read_to_string(&header_path).map_err(RecordingError::io(&header_path))?;
+            let found = serde_json::from_str::<Header>(&text);
+            if !found.is_ok_and(|found| found == *header) {
+                let message = "holds a recording of another request: choose another folder";
+                return Err(taken(&header_path, message));
+            }
+        } else if lines_path.exists() {
+            return Err(taken(
+                &lines_path,
+                "samples without a recording.json: choose another folder",
+            ));
+        } else {
+            let text = serde_json::to_string_pretty(header).map_err(|e| RecordingError::Io {
+                path: header_path.clone(),
+                source: e.into(),
+            })?;
+            std::fs::write(&header_path, text + "\n").map_err(RecordingError::io(&header_path))?;
+        }
+
+        let mut lines = File::options()
+            .read(true)
+            .append(true)
+            .create(true)
+            .open(&lines_path)
+            .map_err(RecordingError::io(&lines_path))?;
+        let mut next = 0;
+        let mut complete = 0;
+        let mut reader = BufReader::new(&mut lines);
+        let mut line = String::new();
+        while reader
+            .read_line(&mut line)
+            .map_err(RecordingError::io(&lines_path))?
+            > 0
+        {
+            if !line.ends_with('\n') {
+                break;
+            }
+            match serde_json::from_str::<Sample>(&line) {
+                Ok(sample) if sample.id == next => next += 1,
+                _ => {
+                    return Err(taken(
+                        &lines_path,
+                        &format!("line {} is not sample {next}", next + 1),
+                    ));
+                }
+            }
+            complete += line.len() as u64;
+            line.clear();
+        }
+        lines
+            .set_len(complete)
+            .map_err(RecordingError::io(&lines_path))?;
+        Ok(Writer {
+            folder: folder.to_owned(),
+            lines,
+            next,
+        })
+    }
+
+    /// The number of the sample to write next.
+    pub fn next(&self) -> u64 {
+        self.next
+    }
+
+    /// The folder written to.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Adds a sample, whose pictures are already written. Samples come in order.
+    ///
+    /// # Errors
+    /// The line cannot be written.
+    pub fn append(&mut self, sample: &Sample) -> Result<(), RecordingError> {
+        let path = || self.folder.join("samples.jsonl");
+        let mut line = serde_json::to_string(sample).map_err(|e| RecordingError::Io {
+            path: path(),
+            source: e.into(),
+        })?;
+        line.push('\n');
+        self.lines
+            .write_all(line.as_bytes())
+            .map_err(RecordingError::io(path()))?;
+        self.next += 1;
+        Ok(())
+    }
+}
+
+/// Writes a picture as sample `id`'s image (JPEG, quality 92) and mask (PNG).
+///
+/// # Errors
+/// A file cannot be written.
+pub fn write_picture(
+    folder: &Path,
+    sample: &Sample,
+    picture: &Picture,
+) -> Result<(), RecordingError> {
+    let mut jpeg = Vec::new();
+    let image_path = folder.join(&sample.image);
+    let mask_path = folder.join(&sample.mask);
+    let failed = |path: &Path| {
+        let path = path.to_owned();
+        move |source| RecordingError::Picture { path, source }
+    };
+    JpegEncoder::new_with_quality(&mut jpeg, 92)
+        .write_image(&picture.rgb, WIDTH, HEIGHT, ExtendedColorType::Rgb8)
+        .map_err(failed(&image_path))?;
+    let mut png = Vec::new();
+    PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::NoFilter)
+        .write_image(&picture.mask, WIDTH, HEIGHT, ExtendedColorType::L8)
+        .map_err(failed(&mask_path))?;
+    std::fs::write(&image_path, jpeg).map_err(RecordingError::io(&image_path))?;
+    std::fs::write(&mask_path, png).map_err(RecordingError::io(&mask_path))
+}

@@ -1,0 +1,324 @@
+//! A robot from its URDF: links, joints, meshes, forward kinematics.
+
+use std::collections::HashMap;
+use std::f64::consts::PI;
+use std::path::{Path, PathBuf};
+
+use glam::{Affine3A, DAffine3, DMat3, DQuat, DVec3, Vec3};
+use urdf_rs::{Geometry, JointType};
+
+use super::RecordingError;
+use super::mesh::Mesh;
+
+/// A link's meshes, in the link's own frame.
+#[derive(Debug)]
+pub struct Link {
+    /// The link's name in the URDF.
+    pub name: String,
+    /// What it looks like: one mesh a material.
+    pub visual: Vec<Mesh>,
+    /// What it collides with; the visual meshes where the URDF gives no others.
+    pub collision: Vec<Mesh>,
+    /// The link it hangs on; `None` for the root.
+    pub parent: Option<usize>,
+}
+
+/// A moving joint of the chain from the base to the tool.
+#[derive(Debug)]
+pub struct Joint {
+    /// The joint's name without a trailing `_joint`.
+    pub name: String,
+    /// Range of the joint's angle, radians.
+    pub range: [f64; 2],
+    /// The link that the joint moves: its frame is the joint's frame.
+    pub child: usize,
+    /// The link that the joint hangs on.
+    pub parent: usize,
+}
+
+/// A step of the way from the root to all links, parents first.
+#[derive(Debug)]
+struct Step {
+    parent: usize,
+    child: usize,
+    origin: DAffine3,
+    /// The rotation axis in the child's frame, and which moving joint turns it.
+    moved_by: Option<(DVec3, usize)>,
+}
+
+/// A robot: what a URDF file and its meshes say.
+#[derive(Debug)]
+pub struct Robot {
+    /// All links.
+    pub links: Vec<Link>,
+    /// The revolute joints, base first.
+    pub joints: Vec<Joint>,
+    steps: Vec<Step>,
+    base: usize,
+}
+
+impl Robot {
+    /// Reads a URDF and all its meshes. `packages` says where `package://NAME/` is; a package that is
+    /// not listed is searched for upwards from the URDF.
+    ///
+    /// # Errors
+    /// A file is missing or unreadable (the error names it), or the URDF has no revolute joint, or its
+    /// joints do not form a tree.
+    pub fn load(urdf: &Path, packages: &[(String, PathBuf)]) -> Result<Robot, RecordingError> {
+        let text = std::fs::read_to_string(urdf).map_err(RecordingError::io(urdf))?;
+        let fail = |message: String| RecordingError::Urdf {
+            path: urdf.to_owned(),
+            message,
+        };
+        let description =
+            urdf_rs::read_from_string(&text).map_err(|e| fail(format!("not a URDF: {e}")))?;
+
+        let mut links = Vec::new();
+        let mut index = HashMap::new();
+        for link in &description.links {
+            let files = Files {
+                urdf,
+                packages,
+                link: &link.name,
+            };
+            let mut visual = Vec::new();
+            for part in &link.visual {
+                let mut meshes = files.geometry(&part.geometry, &part.origin)?;
+                let colour = part.material.as_ref().and_then(|m| {
+                    let named = description.materials.iter().find(|d| d.name == m.name);
+                    m.color
+                        .as_ref()
+                        .or_else(|| named.and_then(|d| d.color.as_ref()))
+                });
+                if let Some(colour) = colour {
+                    let [r, g, b, _] = *colour.rgba;
+                    meshes
+                        .iter_mut()
+                        .for_each(|m| m.diffuse = Some([r as f32, g as f32, b as f32]));
+                }
+                visual.append(&mut meshes);
+            }
+            let mut collision = Vec::new();
+            for part in &link.collision {
+                collision.append(&mut files.geometry(&part.geometry, &part.origin)?);
+            }
+            if collision.is_empty() {
+                collision.clone_from(&visual);
+            }
+            index.insert(link.name.as_str(), links.len());
+            links.push(Link {
+                name: link.name.clone(),
+                visual,
+                collision,
+                parent: None,
+            });
+        }
+
+        let find = |name: &str, joint: &str| {
+            index.get(name).copied().ok_or_else(|| {
+                fail(format!(
+                    "joint \"{joint}\" names the link \"{name}\", which does not exist"
+                ))
+            })
+        };
+        let mut hanging: HashMap<usize, Vec<(&urdf_rs::Joint, usize)>> = HashMap::new();
+        for joint in &description.joints {
+            let parent = find(&joint.parent.link, &joint.name)?;
+            let child = find(&joint.child.link, &joint.name)?;
+            let slot = links.get_mut(child).map(|l| &mut l.parent);
+            if let Some(Some(_)) = slot {
+                let name = &joint.child.link;
+                return Err(fail(format!(
+                    "the link \"{name}\" hangs on more than one joint"
+                )));
+            }
+            if let Some(slot) = slot {
+                *slot = Some(parent);
+            }
+            hanging.entry(parent).or_default().push((joint, child));
+        }
+
+        let mut joints: Vec<Joint> = Vec::new();
+        let mut steps = Vec::new();
+        let mut open: Vec<usize> = (0..links.len())
+            .filter(|&i| links.get(i).is_some_and(|l| l.parent.is_none()))
+            .collect();
+        while let Some(parent) = open.pop() {
+            for &(joint, child) in hanging.get(&parent).into_iter().flatten() {
+                let turns = matches!(
+                    joint.joint_type,
+                    JointType::Revolute | JointType::Continuous
+                );
+                let moved_by = turns.then(|| {
+                    let range = match joint.joint_type {
+                        // Limits left out read as infinite.
+                        JointType::Revolute if joint.limit.upper < f64::INFINITY => {
+                            [joint.limit.lower, joint.limit.upper]
+                        }
+                        _ => [-PI, PI],
+                    };
+                    let name = joint
+                        .name
+                        .strip_suffix("_joint")
+                        .unwrap_or(&joint.name)
+                        .to_owned();
+                    joints.push(Joint {
+                        name,
+                        range,
+                        child,
+                        parent,
+                    });
+                    (
+                        DVec3::from(*joint.axis.xyz).normalize_or(DVec3::X),
+                        joints.len() - 1,
+                    )
+                });
+                steps.push(Step {
+                    parent,
+                    child,
+                    origin: pose(&joint.origin),
+                    moved_by,
+                });
+                open.push(child);
+            }
+        }
+        if steps.len() != description.joints.len() {
+            return Err(fail(
+                "expected the joints to form a tree, found a loop".into(),
+            ));
+        }
+        let Some(first) = joints.first() else {
+            return Err(fail(
+                "expected at least one revolute joint, found none".into(),
+            ));
+        };
+        if let Some(bad) = joints
+            .iter()
+            .find(|j| !(0.0..f64::INFINITY).contains(&(j.range[1] - j.range[0])))
+        {
+            let ([lower, upper], name) = (bad.range, &bad.name);
+            return Err(fail(format!(
+                "joint \"{name}\": expected a finite range, found {lower} to {upper}"
+            )));
+        }
+        let base = first.parent;
+        Ok(Robot {
+            links,
+            joints,
+            steps,
+            base,
+        })
+    }
+
+    /// Poses of all links in the base frame (the frame of the first joint's parent link), in the order
+    /// of `links`. `angles`: one a moving joint, radians; missing ones count as zero.
+    pub fn link_poses(&self, angles: &[f64]) -> Vec<DAffine3> {
+        let mut poses = vec![DAffine3::IDENTITY; self.links.len()];
+        for step in &self.steps {
+            let turn = step.moved_by.map_or(DQuat::IDENTITY, |(axis, joint)| {
+                DQuat::from_axis_angle(axis, angles.get(joint).copied().unwrap_or(0.0))
+            });
+            let pose = poses.get(step.parent).copied().unwrap_or_default()
+                * step.origin
+                * DAffine3::from_quat(turn);
+            if let Some(slot) = poses.get_mut(step.child) {
+                *slot = pose;
+            }
+        }
+        let to_base = poses.get(self.base).copied().unwrap_or_default().inverse();
+        poses.iter().map(|&pose| to_base * pose).collect()
+    }
+
+    /// Origins of the moving joints' frames in the base frame, metres, from link poses.
+    pub fn joint_origins(&self, link_poses: &[DAffine3]) -> Vec<DVec3> {
+        let pose = |link| link_poses.get(link).copied().unwrap_or_default();
+        self.joints
+            .iter()
+            .map(|j| pose(j.child).translation)
+            .collect()
+    }
+
+    /// The link that carries the first moving joint.
+    pub fn base_link(&self) -> usize {
+        self.base
+    }
+
+    /// The index of the link with this name.
+    pub fn find_link(&self, name: &str) -> Option<usize> {
+        self.links.iter().position(|l| l.name == name)
+    }
+}
+
+fn pose(pose: &urdf_rs::Pose) -> DAffine3 {
+    let [roll, pitch, yaw] = *pose.rpy;
+    let rotation =
+        DMat3::from_rotation_z(yaw) * DMat3::from_rotation_y(pitch) * DMat3::from_rotation_x(roll);
+    DAffine3::from_mat3_translation(rotation, DVec3::from(*pose.xyz))
+}
+
+struct Files<'a> {
+    urdf: &'a Path,
+    packages: &'a [(String, PathBuf)],
+    link: &'a str,
+}
+
+impl Files<'_> {
+    fn geometry(
+        &self,
+        geometry: &Geometry,
+        origin: &urdf_rs::Pose,
+    ) -> Result<Vec<Mesh>, RecordingError> {
+        let size = |v: [f64; 3]| Affine3A::from_scale(Vec3::from(v.map(|c| c as f32)));
+        let (mut meshes, scale) = match geometry {
+            Geometry::Box { size: edges } => (vec![Mesh::cuboid()], size(**edges)),
+            Geometry::Cylinder { radius, length } | Geometry::Capsule { radius, length } => (
+                vec![Mesh::cylinder()],
+                size([2.0 * radius, 2.0 * radius, *length]),
+            ),
+            Geometry::Sphere { radius } => (vec![Mesh::sphere()], size([2.0 * radius; 3])),
+            Geometry::Mesh { filename, scale } => (
+                Mesh::read(&self.find(filename)?)?,
+                size(scale.map_or([1.0; 3], |s| *s)),
+            ),
+        };
+        let origin = pose(origin);
+        let placed =
+            Affine3A::from_mat3_translation(origin.matrix3.as_mat3(), origin.translation.as_vec3());
+        meshes.iter_mut().for_each(|m| m.transform(placed * scale));
+        Ok(meshes)
+    }
+
+    /// The file that a URDF's mesh name means.
+    fn find(&self, name: &str) -> Result<PathBuf, RecordingError> {
+        let folder = self.urdf.parent().unwrap_or(Path::new(""));
+        let missing = |looked_for: PathBuf| RecordingError::MissingMesh {
+            urdf: self.urdf.to_owned(),
+            link: self.link.to_owned(),
+            name: name.to_owned(),
+            looked_for,
+        };
+        let Some(inside) = name.strip_prefix("package://") else {
+            let path = folder.join(name.strip_prefix("file://").unwrap_or(name));
+            return if path.is_file() {
+                Ok(path)
+            } else {
+                Err(missing(path))
+            };
+        };
+        let (package, rest) = inside.split_once('/').unwrap_or((inside, ""));
+        if let Some((_, root)) = self.packages.iter().find(|(n, _)| n == package) {
+            let path = root.join(rest);
+            return if path.is_file() {
+                Ok(path)
+            } else {
+                Err(missing(path))
+            };
+        }
+        let absolute = std::path::absolute(folder).map_err(RecordingError::io(folder))?;
+        absolute
+            .ancestors()
+            .flat_map(|up| [up.join(rest), up.join(inside)])
+            .find(|path| path.is_file())
+            .ok_or_else(|| missing(folder.join(rest)))
+    }
+}

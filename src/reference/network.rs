@@ -1,0 +1,49 @@
+use super::{Tensor, concat, conv2d, dense, max_pool2d, sigmoid, upsample2d};
+use crate::network::{Network, Operation, Source};
+
+/// The output of `network` for `input`, whose shape must be the network's; `None` where it is not.
+pub fn run(network: &Network, input: &Tensor) -> Option<Tensor> {
+    run_all(network, input)?.pop()
+}
+
+/// The output of every layer of `network`, in order; `None` where `input` has not the network's shape.
+pub fn run_all(network: &Network, input: &Tensor) -> Option<Vec<Tensor>> {
+    if input.shape() != network.input() {
+        return None;
+    }
+    let mut outputs: Vec<Tensor> = Vec::with_capacity(network.nodes().len());
+    for node in network.nodes() {
+        let sources = node
+            .sources
+            .iter()
+            .map(|source| match source {
+                Source::Input => Some(input),
+                Source::Layer(index) => outputs.get(*index),
+            })
+            .collect::<Option<Vec<_>>>()?;
+        let source = *sources.first()?;
+        let output = match node.layer.operation {
+            Operation::Conv2d {
+                kernel,
+                dilation,
+                activation,
+                ..
+            } => conv2d(
+                source,
+                node.parameters.as_ref()?,
+                kernel,
+                dilation,
+                activation,
+            ),
+            Operation::MaxPool2d { size } => max_pool2d(source, size),
+            Operation::Dense { activation, .. } => {
+                dense(source, node.parameters.as_ref()?, activation)
+            }
+            Operation::Sigmoid => sigmoid(source),
+            Operation::Upsample2d { scale } => upsample2d(source, scale),
+            Operation::Concat => concat(&sources),
+        };
+        outputs.push(output);
+    }
+    Some(outputs)
+}

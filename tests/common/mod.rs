@@ -1,0 +1,233 @@
+//! Shared by the tests of the layers: one device, random networks of one layer, comparison.
+#![allow(
+    dead_code,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    missing_docs
+)]
+
+use std::sync::{Arc, OnceLock};
+
+use whereabot::gpu::{AdapterRequest, Device, NetworkPlan, Tensor};
+use whereabot::network::{Layer, Network, Operation, Parameters, Shape};
+use whereabot::reference;
+
+/// How often a property is tried. Failures print their case; they are kept as tests by hand.
+pub fn cases(count: u32) -> proptest::test_runner::Config {
+    proptest::test_runner::Config {
+        cases: count,
+        failure_persistence: None,
+        ..Default::default()
+    }
+}
+
+/// The adapter that the environment asks for, or the best: Mesa's lavapipe on a machine without a
+/// GPU. A machine without any adapter fails the test: the kernels were not tested.
+pub fn device() -> Arc<Device> {
+    static DEVICE: OnceLock<Arc<Device>> = OnceLock::new();
+    Arc::clone(DEVICE.get_or_init(|| {
+        let device = Device::open(&AdapterRequest::new(None, None))
+            .expect("an adapter is needed: install mesa-vulkan-drivers");
+        Arc::new(device)
+    }))
+}
+
+/// Values in [-1, 1), the same for the same seed.
+pub fn noise(len: usize, seed: u64) -> Vec<f32> {
+    let mut state = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+    (0..len)
+        .map(|_| {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            (state >> 40) as f32 / (1_u64 << 23) as f32 - 1.0
+        })
+        .collect()
+}
+
+/// A network of one layer with random parameters, scaled so that sums stay near 1.
+pub fn one_layer(operation: Operation, input: Shape, seed: u64) -> Network {
+    let layer = Layer {
+        name: "layer".into(),
+        inputs: vec!["input".into()],
+        operation,
+    };
+    network(vec![layer], input, seed)
+}
+
+/// A network of these layers with random parameters; its input is named `input`.
+pub fn network(layers: Vec<Layer>, input: Shape, seed: u64) -> Network {
+    Network::new("input", input, layers, |_, weight, bias| {
+        let len: usize = weight.iter().product();
+        let scale = (3.0 * weight[0] as f32 / len as f32).sqrt();
+        Ok(Parameters {
+            weight: noise(len, seed).iter().map(|w| w * scale).collect(),
+            bias: noise(bias[0], seed + 1),
+        })
+    })
+    .unwrap()
+}
+
+/// What the GPU makes of a batch `[image][channel][row][column]`.
+pub fn on_gpu(network: &Network, batch: usize, values: &[f32]) -> Vec<f32> {
+    let device = device();
+    let input = Tensor::new(&device, "input", network.input(), batch).unwrap();
+    input.write(&device, values).unwrap();
+    let plan = NetworkPlan::new(&device, "test", network, &input).unwrap();
+    plan.run(&device).unwrap();
+    plan.output().read(&device).unwrap()
+}
+
+/// What the reference makes of the same.
+pub fn on_reference(network: &Network, values: &[f32]) -> Vec<f32> {
+    values
+        .chunks_exact(network.input().len())
+        .flat_map(|image| {
+            let input = reference::Tensor::new(network.input(), image.to_vec()).unwrap();
+            reference::run(network, &input).unwrap().data().to_vec()
+        })
+        .collect()
+}
+
+/// The greatest difference; `Err` for NaN or different lengths. This is the comparator of all tests.
+pub fn difference(a: &[f32], b: &[f32]) -> Result<f32, String> {
+    if a.len() != b.len() {
+        return Err(format!("{} values and {}", a.len(), b.len()));
+    }
+    let mut greatest = 0.0_f32;
+    for (i, (x, y)) in a.iter().zip(b).enumerate() {
+        // Infinities of the same sign differ by nothing.
+        let d = if x == y { 0.0 } else { (x - y).abs() };
+        if !d.is_finite() {
+            return Err(format!("{x} and {y} at {i}"));
+        }
+        greatest = greatest.max(d);
+    }
+    Ok(greatest)
+}
+
+/// The same network with its first weight changed by `change`: for negative controls.
+pub fn with_one_weight_changed(network: &Network, change: f32) -> Network {
+    let layers = network.nodes().iter().map(|n| n.layer.clone()).collect();
+    let mut parameters = network.nodes().iter().filter_map(|n| n.parameters.clone());
+    let mut change = Some(change);
+    Network::new("input", network.input(), layers, |_, _, _| {
+        let mut parameters = parameters.next().unwrap();
+        parameters.weight[0] += change.take().unwrap_or(0.0);
+        Ok(parameters)
+    })
+    .unwrap()
+}
+
+/// Holds the GPU's layer to the reference.
+pub fn check_layer(operation: Operation, input: Shape, batch: usize, seed: u64, tolerance: f32) {
+    check_network(&one_layer(operation, input, seed), batch, seed, tolerance);
+}
+
+/// Holds the GPU's network to the reference.
+pub fn check_network(network: &Network, batch: usize, seed: u64, tolerance: f32) {
+    let input = network.input();
+    let values = noise(batch * input.len(), seed + 2);
+    let gpu = on_gpu(network, batch, &values);
+    let expected = on_reference(network, &values);
+    let found = difference(&gpu, &expected).unwrap();
+    let last = &network.nodes().last().unwrap().layer;
+    assert!(
+        found <= tolerance,
+        "{last:?} on {input} x {batch}: differs by {found}, allowed {tolerance}"
+    );
+}
+
+/// Runs one step on its own.
+pub fn run_step(device: &Device, step: &whereabot::gpu::Step) {
+    let mut encoder = device.wgpu().create_command_encoder(&Default::default());
+    step.encode(&mut encoder.begin_compute_pass(&Default::default()));
+    device.queue().submit([encoder.finish()]);
+    device.wait().unwrap();
+}
+
+/// The description of a model of the paper's shape with few filters, for images of `width` x `height`.
+pub fn description(width: u32, height: u32, filters: usize) -> serde_json::Value {
+    let conv = |name: &str, input: &str, out: usize, dilation: usize, activation: &str| {
+        serde_json::json!({"name": name, "op": "conv2d", "inputs": [input], "out_channels": out,
+            "kernel": 3, "dilation": dilation, "activation": activation})
+    };
+    let pool = |name: &str, input: &str| serde_json::json!({"name": name, "op": "max_pool2d", "inputs": [input], "size": 2});
+    let focal = f64::from(width) * 182.5 / 256.0;
+    serde_json::json!({
+        "version": 1, "family": "paper", "robot": "ur5",
+        "joints": ["shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"],
+        "input": {"width": width, "height": height},
+        "camera": {"fx": focal, "fy": focal,
+            "cx": 0.5 * f64::from(width - 1), "cy": 0.5 * f64::from(height - 1)},
+        "mask_network": {"layers": [
+            conv("conv1", "image", filters, 1, "relu"), conv("conv2", "conv1", filters, 2, "relu"),
+            conv("conv3", "conv2", filters, 4, "relu"), conv("conv4", "conv3", filters, 8, "relu"),
+            conv("conv5", "conv4", 1, 1, "sigmoid")]},
+        "overlay": {"rule": "multiply"},
+        "joint_network": {"layers": [
+            conv("conv1", "overlay", filters, 1, "relu"), pool("pool1", "conv1"),
+            conv("conv2", "pool1", 2 * filters, 1, "relu"), pool("pool2", "conv2"),
+            conv("conv3", "pool2", 4 * filters, 1, "relu"),
+            {"name": "dense", "op": "dense", "inputs": ["conv3"], "out_features": 18, "activation": "none"}]},
+        "presence": {"mask_threshold": 0.5, "min_coverage": 0.01}
+    })
+}
+
+/// Dimensions of each tensor that the networks of `description` need.
+pub fn tensor_dims(description: &serde_json::Value) -> Vec<(String, Vec<usize>)> {
+    let side = |name: &str| description["input"][name].as_u64().unwrap() as usize;
+    let image = Shape::new(3, side("height"), side("width"));
+    let mut dims = Vec::new();
+    for (network, input) in [("mask", "image"), ("joint", "overlay")] {
+        let layers = description[format!("{network}_network")]["layers"].clone();
+        let layers: Vec<Layer> = serde_json::from_value(layers).unwrap();
+        Network::new(input, image, layers, |layer, weight, bias| {
+            dims.push((format!("{network}.{layer}.weight"), weight.to_vec()));
+            dims.push((format!("{network}.{layer}.bias"), bias.to_vec()));
+            Ok(Parameters {
+                weight: vec![],
+                bias: vec![],
+            })
+        })
+        .unwrap();
+    }
+    dims
+}
+
+/// The bytes of a model file with random weights for `description`. The joints' biases put the robot
+/// in front of the camera.
+pub fn model_file(description: &serde_json::Value, seed: u64) -> Vec<u8> {
+    let tensors: Vec<(String, Vec<usize>, Vec<f32>)> = tensor_dims(description)
+        .into_iter()
+        .enumerate()
+        .map(|(index, (name, dims))| {
+            let len: usize = dims.iter().product();
+            let mut values = noise(len, seed + index as u64);
+            if dims.len() > 1 {
+                let scale = (3.0 * dims[0] as f32 / len as f32).sqrt();
+                values.iter_mut().for_each(|v| *v *= scale);
+            }
+            if name == "joint.dense.bias" {
+                values.iter_mut().skip(2).step_by(3).for_each(|z| *z = 3.0);
+            }
+            (name, dims, values)
+        })
+        .collect();
+    let views = tensors.iter().map(|(name, dims, values)| {
+        let view = safetensors::tensor::TensorView::new(
+            safetensors::Dtype::F32,
+            dims.clone(),
+            bytemuck::cast_slice(values),
+        );
+        (name.as_str(), view.unwrap())
+    });
+    let metadata = [("whereabot".to_owned(), description.to_string())].into();
+    safetensors::serialize(views, Some(metadata)).unwrap()
+}
+
+/// The largest difference that rounding explains in a sum of `terms` values near 1.
+pub fn rounding(terms: usize) -> f32 {
+    2e-6 * (terms as f32).sqrt().max(1.0)
+}

@@ -1,0 +1,100 @@
+//! The convolution kernel against the reference.
+#![allow(clippy::unwrap_used, missing_docs)]
+
+mod common;
+
+use common::{check_layer, difference, noise, on_gpu, on_reference, one_layer, rounding};
+use proptest::prelude::*;
+use whereabot::network::{Activation, Operation, Shape};
+
+fn conv2d(
+    out_channels: usize,
+    kernel: usize,
+    dilation: usize,
+    activation: Activation,
+) -> Operation {
+    Operation::Conv2d {
+        out_channels,
+        kernel,
+        dilation,
+        activation,
+    }
+}
+
+fn any_activation() -> impl Strategy<Value = Activation> {
+    prop_oneof![
+        Just(Activation::None),
+        Just(Activation::Relu),
+        Just(Activation::Sigmoid)
+    ]
+}
+
+proptest! {
+    #![proptest_config(common::cases(48))]
+
+    #[test]
+    fn the_kernel_agrees_with_the_reference(
+        (channels, out_channels) in (1_usize..14, 1_usize..20),
+        (height, width) in (1_usize..24, 1_usize..24),
+        batch in 1_usize..4,
+        kernel in prop_oneof![Just(1_usize), Just(3), Just(5)],
+        dilation in 1_usize..30,
+        activation in any_activation(),
+        seed in any::<u32>(),
+    ) {
+        let input = Shape::new(channels, height, width);
+        let terms = channels * kernel * kernel;
+        check_layer(conv2d(out_channels, kernel, dilation, activation), input, batch, seed.into(), rounding(terms));
+    }
+}
+
+#[test]
+fn layers_of_the_paper_agree() {
+    for (channels, out_channels, dilation) in [(3, 32, 1), (32, 32, 8), (32, 1, 1)] {
+        let operation = conv2d(out_channels, 3, dilation, Activation::Relu);
+        check_layer(operation, Shape::new(channels, 53, 64), 1, 7, 1e-5);
+    }
+}
+
+#[test]
+fn more_workgroups_than_one_dimension_holds() {
+    // An invocation makes four columns of a row, a workgroup 64 times that.
+    let input = Shape::new(1, 65_536 * 64 + 5, 1);
+    check_layer(conv2d(1, 1, 1, Activation::None), input, 1, 11, 1e-6);
+}
+
+#[test]
+fn a_dilation_beyond_the_image_reaches_only_zeros() {
+    let input = Shape::new(5, 6, 7);
+    let wide = one_layer(conv2d(3, 3, 50, Activation::None), input, 3);
+    let values = noise(input.len(), 5);
+    // Then only the kernel's centre counts: the reference agrees with a 1 x 1 convolution.
+    let mut centre = one_layer(conv2d(3, 1, 1, Activation::None), input, 3);
+    let taps = wide.nodes()[0].parameters.clone().unwrap();
+    centre = whereabot::network::Network::new(
+        "input",
+        input,
+        vec![centre.nodes()[0].layer.clone()],
+        |_, _, _| {
+            Ok(whereabot::network::Parameters {
+                weight: taps.weight.iter().skip(4).step_by(9).copied().collect(),
+                bias: taps.bias.clone(),
+            })
+        },
+    )
+    .unwrap();
+    let expected = on_reference(&centre, &values);
+    assert!(difference(&on_reference(&wide, &values), &expected).unwrap() < 1e-6);
+    assert!(difference(&on_gpu(&wide, 1, &values), &expected).unwrap() < 1e-6);
+}
+
+#[test]
+fn a_wrong_weight_is_noticed() {
+    let input = Shape::new(6, 9, 11);
+    let network = one_layer(conv2d(5, 3, 2, Activation::Relu), input, 1);
+    let other = common::with_one_weight_changed(&network, 1e-2);
+    let values = noise(input.len(), 2);
+    let gpu = on_gpu(&network, 1, &values);
+    assert!(difference(&gpu, &on_reference(&network, &values)).unwrap() < 1e-5);
+    assert!(difference(&gpu, &on_reference(&other, &values)).unwrap() > 1e-3);
+}

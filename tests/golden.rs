@@ -1,0 +1,139 @@
+//! The reference, and the kernels, against PyTorch's outputs (made by `trainer/`).
+#![allow(clippy::unwrap_used, clippy::panic, missing_docs)]
+
+mod common;
+
+use std::path::PathBuf;
+
+use common::{difference, with_one_weight_changed};
+use safetensors::SafeTensors;
+use whereabot::gpu::{NetworkPlan, Tensor};
+use whereabot::network::{Model, Network, Shape};
+use whereabot::reference;
+
+const NAMES: [&str; 3] = ["tiny", "threshold", "tiny_f16"];
+
+fn file(name: &str) -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+        .join("tests/data/golden")
+        .join(name)
+}
+
+fn model(name: &str) -> Model {
+    Model::load(file(&format!("{name}.safetensors"))).unwrap()
+}
+
+/// PyTorch's value of one tensor.
+fn golden(name: &str, tensor: &str) -> Vec<f32> {
+    let bytes = std::fs::read(file(&format!("{name}.activations.safetensors"))).unwrap();
+    let tensors = SafeTensors::deserialize(&bytes).unwrap();
+    bytemuck::pod_collect_to_vec(tensors.tensor(tensor).unwrap().data())
+}
+
+fn input(name: &str, tensor: &str, shape: Shape) -> reference::Tensor {
+    reference::Tensor::new(shape, golden(name, tensor)).unwrap()
+}
+
+/// The greatest difference of any layer from PyTorch.
+fn greatest(network: &Network, name: &str, prefix: &str, source: &str) -> f32 {
+    let input = input(name, &format!("{prefix}.{source}"), network.input());
+    let outputs = reference::run_all(network, &input).unwrap();
+    network
+        .nodes()
+        .iter()
+        .zip(outputs)
+        .map(|(node, output)| {
+            let expected = golden(name, &format!("{prefix}.{}", node.layer.name));
+            difference(output.data(), &expected).unwrap()
+        })
+        .fold(0.0, f32::max)
+}
+
+#[test]
+fn every_layer_of_the_reference_agrees_with_pytorch() {
+    for name in NAMES {
+        let model = model(name);
+        let mask = greatest(&model.mask_network, name, "mask", "image");
+        let joint = greatest(&model.joint_network, name, "joint", "overlay");
+        assert!(mask <= 1e-5 && joint <= 1e-5, "{name}: {mask}, {joint}");
+    }
+}
+
+#[test]
+fn a_wrong_weight_is_noticed() {
+    for (prefix, source) in [("mask", "image"), ("joint", "overlay")] {
+        let model = model("tiny");
+        let network = if prefix == "mask" {
+            &model.mask_network
+        } else {
+            &model.joint_network
+        };
+        let other = rename_input(network, source);
+        assert!(greatest(&other, "tiny", prefix, source) > 1e-4);
+    }
+}
+
+/// One weight changed, with the input's name kept.
+fn rename_input(network: &Network, input: &str) -> Network {
+    let mut layers: Vec<_> = network.nodes().iter().map(|n| n.layer.clone()).collect();
+    for layer in &mut layers {
+        for name in &mut layer.inputs {
+            if name == input {
+                *name = "input".into();
+            }
+        }
+    }
+    let mut values = network.nodes().iter().filter_map(|n| n.parameters.clone());
+    let same = Network::new("input", network.input(), layers, |_, _, _| {
+        Ok(values.next().unwrap())
+    })
+    .unwrap();
+    with_one_weight_changed(&same, 1e-2)
+}
+
+#[test]
+fn the_overlay_agrees_with_pytorch() {
+    for name in NAMES {
+        let model = model(name);
+        let shape = model.mask_network.input();
+        let image = input(name, "mask.image", shape);
+        let mask = input(
+            name,
+            &format!(
+                "mask.{}",
+                model.mask_network.nodes().last().unwrap().layer.name
+            ),
+            model.mask_network.output(),
+        );
+        let overlay = reference::overlay(&image, &mask, model.description.overlay);
+        let expected = golden(name, "joint.overlay");
+        assert!(difference(overlay.data(), &expected).unwrap() <= 1e-5);
+        assert!(difference(image.data(), &expected).unwrap() > 1e-2);
+    }
+}
+
+#[test]
+fn every_layer_of_the_gpu_agrees_with_pytorch() {
+    let device = common::device();
+    for name in NAMES {
+        let model = model(name);
+        let networks = [
+            (&model.mask_network, "mask", "image"),
+            (&model.joint_network, "joint", "overlay"),
+        ];
+        for (network, prefix, source) in networks {
+            let input = Tensor::new(&device, "input", network.input(), 1).unwrap();
+            input
+                .write(&device, &golden(name, &format!("{prefix}.{source}")))
+                .unwrap();
+            let plan = NetworkPlan::new(&device, prefix, network, &input).unwrap();
+            plan.run(&device).unwrap();
+            for (node, output) in network.nodes().iter().zip(plan.outputs()) {
+                let tensor = format!("{prefix}.{}", node.layer.name);
+                let found = output.read(&device).unwrap();
+                let difference = difference(&found, &golden(name, &tensor)).unwrap();
+                assert!(difference <= 1e-5, "{name} {tensor}: {difference}");
+            }
+        }
+    }
+}

@@ -1,0 +1,244 @@
+//! Model files: what is refused, and what the error says.
+#![allow(clippy::unwrap_used, clippy::panic, missing_docs)]
+
+mod common;
+
+use common::{cases, description, model_file};
+use proptest::prelude::*;
+use safetensors::SafeTensors;
+use safetensors::tensor::{Dtype, TensorView};
+use serde_json::{Value, json};
+use whereabot::network::Model;
+
+fn small() -> Value {
+    description(24, 16, 4)
+}
+
+/// The error for these bytes; a panic where they load.
+fn refusal(bytes: &[u8]) -> String {
+    match Model::from_bytes(bytes, "robot.safetensors") {
+        Ok(_) => panic!("loaded"),
+        Err(error) => error.to_string(),
+    }
+}
+
+/// A good file with its tensors changed before it is written again.
+fn with_tensors(change: impl Fn(&mut Vec<(String, Dtype, Vec<usize>, Vec<u8>)>)) -> Vec<u8> {
+    let bytes = model_file(&small(), 1);
+    let good = SafeTensors::deserialize(&bytes).unwrap();
+    let mut tensors: Vec<_> = good
+        .iter()
+        .map(|(name, view)| {
+            let dims = view.shape().to_vec();
+            (name.to_owned(), view.dtype(), dims, view.data().to_vec())
+        })
+        .collect();
+    change(&mut tensors);
+    let views = tensors.iter().map(|(name, dtype, dims, data)| {
+        let view = TensorView::new(*dtype, dims.clone(), data).unwrap();
+        (name.as_str(), view)
+    });
+    let metadata = [("whereabot".to_owned(), small().to_string())].into();
+    safetensors::serialize(views, Some(metadata)).unwrap()
+}
+
+/// The error for a good file whose description is changed.
+fn with_description(change: impl Fn(&mut Value)) -> String {
+    let mut description = small();
+    let tensors = model_file(&description, 1);
+    change(&mut description);
+    let good = SafeTensors::deserialize(&tensors).unwrap();
+    let metadata = [("whereabot".to_owned(), description.to_string())].into();
+    refusal(&safetensors::serialize(good.iter(), Some(metadata)).unwrap())
+}
+
+fn assert_says(error: &str, parts: &[&str]) {
+    for part in parts.iter().chain(&["robot.safetensors"]) {
+        assert!(error.contains(part), "`{part}` is not in: {error}");
+    }
+}
+
+#[test]
+fn a_good_file_loads() {
+    let model = Model::from_bytes(&with_tensors(|_| {}), "robot.safetensors").unwrap();
+    assert_eq!(model.description.robot, "ur5");
+    assert_eq!(model.joint_network.output().len(), 18);
+}
+
+#[test]
+fn a_missing_tensor_is_named() {
+    let bytes = with_tensors(|t| t.retain(|(name, ..)| name != "mask.conv3.bias"));
+    assert_says(
+        &refusal(&bytes),
+        &["mask.conv3.bias", "expected dimensions [4]"],
+    );
+}
+
+#[test]
+fn an_extra_tensor_is_named() {
+    let bytes =
+        with_tensors(|t| t.push(("mask.conv9.bias".into(), Dtype::F32, vec![1], vec![0; 4])));
+    assert_says(&refusal(&bytes), &["mask.conv9.bias", "none uses"]);
+}
+
+#[test]
+fn a_tensor_of_other_dimensions_is_named() {
+    let bytes = with_tensors(|tensors| {
+        for (name, _, dims, _) in tensors {
+            if name == "mask.conv1.weight" {
+                dims.reverse();
+            }
+        }
+    });
+    assert_says(
+        &refusal(&bytes),
+        &["mask.conv1.weight", "[4, 3, 3, 3]", "[3, 3, 3, 4]"],
+    );
+}
+
+#[test]
+fn a_dtype_that_is_no_float_is_named() {
+    let bytes = with_tensors(|tensors| {
+        for (name, dtype, ..) in tensors {
+            if name == "joint.dense.bias" {
+                *dtype = Dtype::I32;
+            }
+        }
+    });
+    assert_says(&refusal(&bytes), &["joint.dense.bias", "F32 or F16", "I32"]);
+}
+
+#[test]
+fn nan_and_infinity_are_named() {
+    for value in [f32::NAN, f32::INFINITY] {
+        let bytes = with_tensors(|tensors| {
+            for (name, _, _, data) in tensors {
+                if name == "mask.conv2.weight" {
+                    data[40..44].copy_from_slice(&value.to_le_bytes());
+                }
+            }
+        });
+        assert_says(
+            &refusal(&bytes),
+            &["mask.conv2.weight", "finite", "index 10"],
+        );
+    }
+}
+
+#[test]
+fn a_file_of_another_network_is_refused() {
+    let metadata = [("format".to_owned(), "pt".to_owned())].into();
+    let data = [0_u8; 16];
+    let view = TensorView::new(Dtype::F32, vec![4], &data).unwrap();
+    let bytes = safetensors::serialize([("fc.weight", view)], Some(metadata)).unwrap();
+    assert_says(&refusal(&bytes), &["metadata key `whereabot`"]);
+}
+
+#[test]
+fn descriptions_that_mean_something_else_are_refused() {
+    type Change = fn(&mut Value);
+    let changes: [(Change, &[&str]); 14] = [
+        (
+            |d| d["version"] = json!(2),
+            &["version: expected 1, found 2"],
+        ),
+        (|d| d["surprise"] = json!(1), &["surprise"]),
+        (
+            |d| d["mask_network"]["layers"][1]["stride"] = json!(2),
+            &["stride"],
+        ),
+        (
+            |d| d["mask_network"]["layers"][0]["op"] = json!("conv3d"),
+            &["conv3d"],
+        ),
+        (
+            |d| d["mask_network"]["layers"][1]["kernel"] = json!(4),
+            &["mask.conv2", "odd", "found 4"],
+        ),
+        (
+            |d| d["mask_network"]["layers"][1]["dilation"] = json!(0),
+            &["mask.conv2", "dilation"],
+        ),
+        (
+            |d| d["mask_network"]["layers"][1]["inputs"] = json!(["conv4"]),
+            &["mask.conv2", "conv4"],
+        ),
+        (
+            |d| d["mask_network"]["layers"][1]["inputs"] = json!([]),
+            &["mask.conv2", "expected one"],
+        ),
+        (
+            |d| d["mask_network"]["layers"][1]["name"] = json!("conv1"),
+            &["conv1"],
+        ),
+        (|d| d["mask_network"]["layers"] = json!([]), &["layers"]),
+        (|d| d["input"]["width"] = json!(0), &["input", "0 x 16"]),
+        (
+            |d| d["input"]["width"] = json!(4_000_000_000_u32),
+            &["input"],
+        ),
+        (|d| d["camera"]["fx"] = json!(0.0), &["camera", "fx 0"]),
+        (
+            |d| d["presence"]["mask_threshold"] = json!(1.5),
+            &["mask_threshold", "1.5"],
+        ),
+    ];
+    for (change, parts) in changes {
+        assert_says(&with_description(change), parts);
+    }
+}
+
+#[test]
+fn huge_numbers_in_a_description_are_refused_before_anything_is_allocated() {
+    let error = with_description(|d| {
+        d["joint_network"]["layers"][0]["out_channels"] = json!(u64::MAX / 2);
+    });
+    assert_says(&error, &["joint.conv1"]);
+    let error = with_description(|d| {
+        d["mask_network"]["layers"][0]["dilation"] = json!(u64::MAX / 2);
+    });
+    assert_says(&error, &["mask.conv1", "reach"]);
+}
+
+#[test]
+fn every_truncation_is_refused() {
+    let bytes = model_file(&small(), 1);
+    let header = 8 + u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+    for end in (0..=header).chain([bytes.len() - 1]) {
+        assert_says(&refusal(&bytes[..end]), &["safetensors"]);
+    }
+}
+
+#[test]
+fn overlapping_data_is_refused() {
+    let bytes = model_file(&small(), 1);
+    let header = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+    let mut text: Value = serde_json::from_slice(&bytes[8..8 + header]).unwrap();
+    let first = text["mask.conv1.bias"]["data_offsets"].clone();
+    text["mask.conv2.bias"]["data_offsets"] = first;
+    let mut text = text.to_string().into_bytes();
+    text.resize(text.len().next_multiple_of(8), b' ');
+    let mut changed = (text.len() as u64).to_le_bytes().to_vec();
+    changed.extend(text);
+    changed.extend(&bytes[8 + header..]);
+    assert_says(&refusal(&changed), &["safetensors"]);
+}
+
+proptest! {
+    #![proptest_config(cases(256))]
+
+    /// Whatever is done to a byte of the header, the answer is a model or an error.
+    #[test]
+    fn a_changed_header_never_panics(position in 0_usize..4000, value in any::<u8>()) {
+        let mut bytes = model_file(&small(), 1);
+        let position = position % bytes.len();
+        bytes[position] = value;
+        let _ = Model::from_bytes(&bytes, "robot.safetensors");
+    }
+}
+
+#[test]
+fn a_missing_file_is_named() {
+    let error = Model::load("no/such/robot.safetensors").unwrap_err();
+    assert_says(&error.to_string(), &["no/such/robot.safetensors"]);
+}

@@ -1,0 +1,76 @@
+//! The overlay kernel against the reference.
+#![allow(clippy::unwrap_used, missing_docs)]
+
+mod common;
+
+use common::{device, difference, noise, run_step};
+use proptest::prelude::*;
+use whereabot::gpu::{Tensor, overlay};
+use whereabot::network::{Overlay, Shape};
+use whereabot::reference;
+
+fn run(image: &[f32], mask: &[f32], shape: Shape, batch: usize, rule: Overlay) -> Vec<f32> {
+    let device = device();
+    let one = Shape::new(1, shape.height, shape.width);
+    let image_tensor = Tensor::new(&device, "image", shape, batch).unwrap();
+    let mask_tensor = Tensor::new(&device, "mask", one, batch).unwrap();
+    let output = Tensor::new(&device, "output", shape, batch).unwrap();
+    image_tensor.write(&device, image).unwrap();
+    mask_tensor.write(&device, mask).unwrap();
+    let step = device
+        .scoped(|| overlay(&device, &image_tensor, &mask_tensor, &output, rule))
+        .unwrap();
+    run_step(&device, &step);
+    output.read(&device).unwrap()
+}
+
+fn expected(image: &[f32], mask: &[f32], shape: Shape, rule: Overlay) -> Vec<f32> {
+    let one = Shape::new(1, shape.height, shape.width);
+    image
+        .chunks_exact(shape.len())
+        .zip(mask.chunks_exact(one.len()))
+        .flat_map(|(image, mask)| {
+            let image = reference::Tensor::new(shape, image.to_vec()).unwrap();
+            let mask = reference::Tensor::new(one, mask.to_vec()).unwrap();
+            reference::overlay(&image, &mask, rule).data().to_vec()
+        })
+        .collect()
+}
+
+proptest! {
+    #![proptest_config(common::cases(16))]
+
+    #[test]
+    fn the_kernel_agrees_with_the_reference(
+        (height, width) in (1_usize..40, 1_usize..40),
+        batch in 1_usize..4,
+        soft in any::<bool>(),
+        seed in any::<u32>(),
+    ) {
+        let shape = Shape::new(3, height, width);
+        let rule = if soft { Overlay::Multiply {} } else { Overlay::Threshold { threshold: 0.25 } };
+        let image = noise(batch * shape.len(), seed.into());
+        let mask = noise(batch * height * width, u64::from(seed) + 1);
+        let found = run(&image, &mask, shape, batch, rule);
+        prop_assert!(difference(&found, &expected(&image, &mask, shape, rule)).unwrap() <= 1e-6);
+    }
+}
+
+#[test]
+fn more_workgroups_than_one_dimension_holds() {
+    let shape = Shape::new(3, 2100, 2100);
+    let (image, mask) = (noise(shape.len(), 1), noise(2100 * 2100, 2));
+    let rule = Overlay::Multiply {};
+    let found = run(&image, &mask, shape, 1, rule);
+    assert!(difference(&found, &expected(&image, &mask, shape, rule)).unwrap() <= 1e-6);
+}
+
+#[test]
+fn a_wrong_pixel_is_noticed() {
+    let shape = Shape::new(3, 5, 7);
+    let (image, mut mask) = (noise(shape.len(), 1), noise(35, 2));
+    let rule = Overlay::Multiply {};
+    let found = run(&image, &mask, shape, 1, rule);
+    mask[17] += 0.5;
+    assert!(difference(&found, &expected(&image, &mask, shape, rule)).unwrap() > 1e-3);
+}

@@ -1,0 +1,626 @@
+//! The recorder: kinematics, meshes, collisions, projection, and recordings on disk.
+#![cfg(feature = "recording")]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
+
+mod common;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use glam::{DAffine3, DVec3};
+use tempfile::TempDir;
+use whereabot::recording::{
+    CollisionModel, HEIGHT, Header, INTRINSICS, Item, Kind, Lamp, Lighting, Material, Mesh,
+    Protocol, RecordingError, Renderer, Request, Robot, Sample, Scene, WIDTH, record,
+};
+
+fn arm_urdf() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/arm/arm.urdf")
+}
+
+/// The UR5's joints as `ur_description` has them, without meshes.
+fn ur5(folder: &Path) -> PathBuf {
+    let joints = [
+        ("shoulder_pan", "0 0 0.089159", "0 0 0", "0 0 1"),
+        ("shoulder_lift", "0 0.13585 0", "0 1.57079632679 0", "0 1 0"),
+        ("elbow", "0 -0.1197 0.425", "0 0 0", "0 1 0"),
+        ("wrist_1", "0 0 0.39225", "0 1.57079632679 0", "0 1 0"),
+        ("wrist_2", "0 0.093 0", "0 0 0", "0 0 1"),
+        ("wrist_3", "0 0 0.09465", "0 0 0", "0 1 0"),
+    ];
+    let mut text = String::from("<robot name='ur5'><link name='world'/><link name='link0'/>");
+    text += "<joint name='world_joint' type='fixed'><parent link='world'/><child link='link0'/>";
+    text += "<origin xyz='1 2 3' rpy='0 0 1'/></joint>";
+    for (i, (name, xyz, rpy, axis)) in joints.iter().enumerate() {
+        let child = i + 1;
+        text += &format!(
+            "<link name='link{child}'/><joint name='{name}_joint' type='revolute'>
+             <parent link='link{i}'/><child link='link{child}'/><origin xyz='{xyz}' rpy='{rpy}'/>
+             <axis xyz='{axis}'/><limit lower='-6.3' upper='6.3' effort='1' velocity='1'/></joint>"
+        );
+    }
+    text += "<link name='tool0'/><joint name='flange' type='fixed'><parent link='link6'/>";
+    text += "<child link='tool0'/><origin xyz='0 0.0823 0' rpy='-1.57079632679 0 0'/></joint>";
+    let path = folder.join("ur5.urdf");
+    fs::write(&path, text + "</robot>").unwrap();
+    path
+}
+
+fn farthest(found: &[DVec3], expected: &[[f64; 3]]) -> f64 {
+    assert_eq!(found.len(), expected.len());
+    let pairs = found.iter().zip(expected);
+    pairs
+        .map(|(f, &e)| f.distance(e.into()))
+        .fold(0.0, f64::max)
+}
+
+const BENT: [f64; 6] = [0.3, -1.2, 1.5, -0.9, -1.4, 0.7];
+
+#[test]
+fn kinematics_agree_with_the_published_robot() {
+    let folder = TempDir::new().unwrap();
+    let robot = Robot::load(&ur5(folder.path()), &[]).unwrap();
+    let names: Vec<&str> = robot.joints.iter().map(|j| j.name.as_str()).collect();
+    let expected = [
+        "shoulder_pan",
+        "shoulder_lift",
+        "elbow",
+        "wrist_1",
+        "wrist_2",
+        "wrist_3",
+    ];
+    assert_eq!(names, expected);
+
+    let straight = [
+        [0.0, 0.0, 0.089159],
+        [0.0, 0.13585, 0.089159],
+        [0.425, 0.01615, 0.089159],
+        [0.81725, 0.01615, 0.089159],
+        [0.81725, 0.10915, 0.089159],
+        [0.81725, 0.10915, -0.005491],
+    ];
+    let bent = [
+        [0.0, 0.0, 0.089159],
+        [-0.040146, 0.129782, 0.089159],
+        [0.142351, 0.060939, 0.485276],
+        [0.500345, 0.17168, 0.369358],
+        [0.472862, 0.260526, 0.369358],
+        [0.523918, 0.27632, 0.29124],
+    ];
+    let tool = robot.find_link("tool0").unwrap();
+    // The flanges come from the manufacturer's DH parameters, a second way to the same place.
+    for (angles, joints, flange) in [
+        ([0.0; 6], straight, [0.81725, 0.19145, -0.005491]),
+        (BENT, bent, [0.455837, 0.269902, 0.245446]),
+    ] {
+        let poses = robot.link_poses(&angles);
+        assert!(farthest(&robot.joint_origins(&poses), &joints) < 2e-6);
+        assert!(farthest(&[poses[tool].translation], &[flange]) < 2e-6);
+
+        let mut wrong = angles;
+        wrong[1] += 0.01;
+        let poses = robot.link_poses(&wrong);
+        assert!(farthest(&robot.joint_origins(&poses), &joints) > 1e-3);
+        assert!(farthest(&[poses[tool].translation], &[flange]) > 1e-3);
+    }
+}
+
+#[test]
+fn meshes_of_all_formats_are_the_same_cube() {
+    for name in ["cube.obj", "cube.stl", "cube.dae"] {
+        let meshes = Mesh::read(&arm_urdf().with_file_name("meshes").join(name)).unwrap();
+        let indices: usize = meshes.iter().map(|m| m.indices.len()).sum();
+        assert_eq!(indices, 36, "{name}");
+        for mesh in &meshes {
+            assert_eq!(mesh.positions.len(), mesh.normals.len());
+            for (position, normal) in mesh.positions.iter().zip(&mesh.normals) {
+                assert!(
+                    position.iter().all(|c| (c.abs() - 0.5).abs() < 1e-6),
+                    "{name}"
+                );
+                // A side's normal points away from the centre, by half an edge.
+                let height: f32 = position.iter().zip(normal).map(|(p, n)| p * n).sum();
+                assert!(
+                    (height - 0.5).abs() < 1e-6,
+                    "{name}: {position:?} {normal:?}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn a_collada_geometry_keeps_all_its_materials() {
+    let meshes = Mesh::read(&arm_urdf().with_file_name("meshes/cube.dae")).unwrap();
+    let found: Vec<_> = meshes
+        .iter()
+        .map(|m| (m.diffuse, m.indices.len()))
+        .collect();
+    assert_eq!(
+        found,
+        [(Some([0.25, 0.35, 0.41]), 18), (Some([0.42; 3]), 18)]
+    );
+}
+
+#[test]
+fn broken_meshes_are_refused() {
+    let folder = TempDir::new().unwrap();
+    let good = fs::read_to_string(arm_urdf().with_file_name("meshes/cube.dae")).unwrap();
+    for (name, text, told) in [
+        ("a.dae", "<COLLADA".to_owned(), "not XML"),
+        (
+            "b.dae",
+            good.replace("visual_scene ", "other "),
+            "visual_scene",
+        ),
+        ("c.dae", good.replace("0 0  2 0", "99 0  2 0"), "index 99"),
+        ("d.dae", good.replace("4 4 4", "4 4 5"), "fewer indices"),
+        (
+            "e.dae",
+            good.replace("4 4 4", "18446744073709551615"),
+            "fewer indices",
+        ),
+        (
+            "f.dae",
+            good.replace("source=\"#normals\"", "source=\"#gone\""),
+            "#gone",
+        ),
+        (
+            "g.dae",
+            good.replace("-50 -50 -50", "-50 inf -50"),
+            "finite",
+        ),
+        ("h.ply", good.clone(), ".ply"),
+    ] {
+        assert_ne!(
+            text,
+            if name == "h.ply" {
+                String::new()
+            } else {
+                good.clone()
+            },
+            "{name}"
+        );
+        let path = folder.path().join(name);
+        fs::write(&path, text).unwrap();
+        let error = Mesh::read(&path).unwrap_err().to_string();
+        assert!(error.contains(told) && error.contains(name), "{error}");
+    }
+    let path = folder.path().join("good.dae");
+    fs::write(&path, good).unwrap();
+    assert!(Mesh::read(&path).is_ok());
+}
+
+#[test]
+fn a_missing_mesh_is_named() {
+    let folder = TempDir::new().unwrap();
+    let text = fs::read_to_string(arm_urdf()).unwrap();
+    let urdf = folder.path().join("arm.urdf");
+    fs::write(&urdf, text.replace("meshes/cube.dae", "meshes/absent.dae")).unwrap();
+    let package = arm_urdf().parent().unwrap().to_owned();
+    let packages = [("arm".to_owned(), package)];
+    match Robot::load(&urdf, &packages).unwrap_err() {
+        RecordingError::MissingMesh {
+            link,
+            name,
+            looked_for,
+            ..
+        } => {
+            assert_eq!(link, "upper");
+            assert_eq!(name, "package://arm/meshes/absent.dae");
+            assert!(looked_for.ends_with("meshes/absent.dae"));
+        }
+        other => panic!("{other}"),
+    }
+    fs::write(&urdf, text).unwrap();
+    assert!(Robot::load(&urdf, &packages).is_ok());
+    // Without the package's place, and with no such folder above the URDF.
+    assert!(matches!(
+        Robot::load(&urdf, &[]),
+        Err(RecordingError::MissingMesh { .. })
+    ));
+}
+
+#[test]
+fn broken_robots_are_refused() {
+    let folder = TempDir::new().unwrap();
+    let urdf = folder.path().join("robot.urdf");
+    let joint = |name: &str, kind: &str, parent: &str, child: &str, limit: &str| {
+        format!(
+            "<joint name='{name}' type='{kind}'><parent link='{parent}'/><child link='{child}'/>
+             <limit {limit} effort='1' velocity='1'/></joint>"
+        )
+    };
+    let limit = "lower='-1' upper='1'";
+    let good = joint("j", "revolute", "a", "b", limit);
+    for (joints, told) in [
+        (
+            joint("j", "fixed", "a", "b", limit),
+            "at least one revolute joint",
+        ),
+        (joint("j", "revolute", "a", "z", limit), "\"z\""),
+        (
+            good.clone() + &joint("k", "revolute", "c", "b", limit),
+            "more than one joint",
+        ),
+        (good.clone() + &joint("k", "fixed", "c", "c", limit), "loop"),
+        (
+            joint("j", "revolute", "a", "b", "lower='2' upper='1'"),
+            "found 2 to 1",
+        ),
+        (
+            joint("j", "revolute", "a", "b", "lower='-1e308' upper='1e308'"),
+            "found -1",
+        ),
+        ("<joint".to_owned(), "not a URDF"),
+    ] {
+        let links = "<link name='a'/><link name='b'/><link name='c'/>";
+        fs::write(&urdf, format!("<robot name='r'>{links}{joints}</robot>")).unwrap();
+        let error = Robot::load(&urdf, &[]).unwrap_err().to_string();
+        assert!(
+            error.contains(told) && error.contains("robot.urdf"),
+            "{error}"
+        );
+    }
+    let links = "<link name='a'/><link name='b'/>";
+    fs::write(&urdf, format!("<robot name='r'>{links}{good}</robot>")).unwrap();
+    assert!(Robot::load(&urdf, &[]).is_ok());
+}
+
+#[test]
+fn collisions_are_found() {
+    let robot = Robot::load(&arm_urdf(), &[]).unwrap();
+    let model = CollisionModel::new(&robot);
+    // Pan, lift, elbow; touches itself; reaches below 9 cm.
+    for (angles, itself, floor) in [
+        ([0.0, 0.0, 0.0], false, false),
+        ([1.0, 0.5, 1.0], false, false),
+        ([0.0, 1.5, 3.0], true, false),
+        ([0.0, 1.5, 1.6], false, true),
+    ] {
+        let poses = robot.link_poses(&angles);
+        assert_eq!(model.self_collision(&poses), itself, "{angles:?}");
+        assert_eq!(model.floor_collision(&poses, 0.09), floor, "{angles:?}");
+        assert!(!model.floor_collision(&poses, 0.0));
+    }
+}
+
+const WHITE: Material = Material {
+    albedo: [0.8; 3],
+    metal: 0.0,
+    specular: 0.0,
+    shininess: 10.0,
+    photo: 0.0,
+    photo_scale: 1.0,
+    photo_offset: [0.0; 2],
+};
+
+fn ball(kind: Kind, centre: DVec3, radius: f64) -> Item {
+    Item {
+        mesh: 0,
+        base_from_mesh: DAffine3::from_translation(centre)
+            * DAffine3::from_scale(DVec3::splat(2.0 * radius)),
+        material: WHITE,
+        kind,
+    }
+}
+
+/// A scene whose base frame is the camera's.
+fn scene(items: Vec<Item>) -> Scene {
+    let lamp = Lamp {
+        direction: -DVec3::Z,
+        colour: [0.3; 3],
+    };
+    Scene {
+        camera_from_base: DAffine3::IDENTITY,
+        items,
+        lighting: Lighting {
+            lamps: [lamp; 3],
+            shadow: 0.5,
+            sky: [0.2; 3],
+            ground: [0.2; 3],
+            mirrored: [(DVec3::X, 0.0); 3],
+        },
+        centre: DVec3::new(0.0, 0.0, 2.0),
+    }
+}
+
+fn black() -> Vec<u8> {
+    vec![0; (4 * WIDTH * HEIGHT) as usize]
+}
+
+/// Mean column and row of the mask.
+fn centroid(mask: &[u8]) -> [f64; 2] {
+    let mut sums = [0.0; 3];
+    for (i, _) in mask.iter().enumerate().filter(|&(_, &m)| m == 255) {
+        sums[0] += (i % WIDTH as usize) as f64;
+        sums[1] += (i / WIDTH as usize) as f64;
+        sums[2] += 1.0;
+    }
+    assert!(sums[2] > 20.0);
+    [sums[0] / sums[2], sums[1] / sums[2]]
+}
+
+#[test]
+fn a_small_ball_appears_where_its_centre_projects() {
+    let device = common::device();
+    let mut renderer = Renderer::new(&device, &[Mesh::sphere()]).unwrap();
+    let mut errors = Vec::new();
+    for (x, y, z) in [
+        (0.0, 0.0, 2.0),
+        (1.2, 0.3, 2.0),
+        (-1.3, -1.0, 2.2),
+        (0.5, 0.9, 1.8),
+        (0.1003, -0.4001, 1.5),
+    ] {
+        let centre = DVec3::new(x, y, z);
+        let items = vec![ball(Kind::Robot, centre, 0.011 * z)];
+        let picture = renderer.draw(&scene(items), &black(), None).unwrap();
+        let found = centroid(&picture.mask);
+        let expected = INTRINSICS.project(centre.to_array()).unwrap();
+        // The picture shows the ball where the mask says, on the black background.
+        for (i, &mask) in picture.mask.iter().enumerate() {
+            let bright = picture.rgb[3 * i] > 0;
+            assert!(mask == 0 || bright, "pixel {i}");
+        }
+        errors.push([found[0] - expected[0], found[1] - expected[1]]);
+    }
+    for axis in 0..2 {
+        let mean = errors.iter().map(|e| e[axis]).sum::<f64>() / errors.len() as f64;
+        let largest = |shift: f64| {
+            errors
+                .iter()
+                .map(|e| (e[axis] + shift).abs())
+                .fold(0.0, f64::max)
+        };
+        assert!(mean.abs() < 0.08 && largest(0.0) < 0.2, "{errors:?}");
+        // Half a pixel, as from the other pixel convention, would be noticed.
+        assert!(largest(0.5) > 0.3 && largest(-0.5) > 0.3);
+    }
+}
+
+#[test]
+fn what_hides_the_robot_is_not_in_the_mask() {
+    let device = common::device();
+    let mut renderer = Renderer::new(&device, &[Mesh::sphere()]).unwrap();
+    let robot = ball(Kind::Robot, DVec3::new(0.0, 0.0, 2.0), 0.3);
+    let near = DVec3::new(0.0, 0.0, 1.5);
+    let far = DVec3::new(0.0, 0.0, 2.6);
+    let mut covered = |other: Option<Item>| {
+        let items = std::iter::once(robot.clone()).chain(other).collect();
+        let picture = renderer.draw(&scene(items), &black(), None).unwrap();
+        picture.mask.iter().filter(|&&m| m == 255).count()
+    };
+    let alone = covered(None);
+    assert!(alone > 9000);
+    assert!(covered(Some(ball(Kind::Scenery, near, 0.1))) < alone - 1000);
+    assert_eq!(covered(Some(ball(Kind::Scenery, far, 0.1))), alone);
+    assert_eq!(covered(Some(ball(Kind::Cable, near, 0.1))), alone);
+    assert_eq!(covered(Some(ball(Kind::Shadow, near, 0.1))), alone);
+}
+
+/// A folder with two pictures and one that only has a picture's name.
+fn backgrounds(folder: &Path) -> PathBuf {
+    let folder = folder.join("backgrounds");
+    fs::create_dir(&folder).unwrap();
+    let noise = common::noise(3 * 64 * 48, 1);
+    let bytes: Vec<u8> = noise.iter().map(|n| (127.0 * (n + 1.0)) as u8).collect();
+    let picture = image::RgbImage::from_raw(64, 48, bytes).unwrap();
+    picture.save(folder.join("a.png")).unwrap();
+    picture.save(folder.join("b.JPG")).unwrap();
+    fs::write(folder.join("c.jpg"), "no picture").unwrap();
+    folder
+}
+
+fn request(folder: &Path, out: &str) -> Request {
+    let backgrounds = folder.join("backgrounds");
+    Request {
+        urdf: arm_urdf(),
+        packages: vec![("arm".into(), arm_urdf().parent().unwrap().to_owned())],
+        robot: "arm".into(),
+        backgrounds,
+        samples: 6,
+        seed: 3,
+        protocol: Protocol::FreeCamera,
+        out: folder.join(out),
+    }
+}
+
+fn samples(out: &Path) -> Vec<Sample> {
+    let text = fs::read_to_string(out.join("samples.jsonl")).unwrap();
+    text.lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect()
+}
+
+fn image_of(out: &Path, name: &str) -> image::DynamicImage {
+    image::open(out.join(name)).unwrap()
+}
+
+#[test]
+fn a_recording_tells_the_truth_about_its_pictures() {
+    let folder = TempDir::new().unwrap();
+    backgrounds(folder.path());
+    let mut request = request(folder.path(), "out");
+    request.samples = 16;
+    let done = std::sync::atomic::AtomicU64::new(0);
+    record(&common::device(), &request, |n| {
+        done.store(n, std::sync::atomic::Ordering::Relaxed);
+    })
+    .unwrap();
+    assert_eq!(done.into_inner(), 16);
+
+    let header = fs::read_to_string(request.out.join("recording.json")).unwrap();
+    let header: Header = serde_json::from_str(&header).unwrap();
+    assert_eq!(header.joints, ["pan", "lift", "elbow"]);
+    assert_eq!((header.width, header.height, header.version), (512, 424, 1));
+    assert_eq!(header.source.urdf, "arm.urdf");
+
+    let robot = Robot::load(&request.urdf, &request.packages).unwrap();
+    let samples = samples(&request.out);
+    assert_eq!(samples.len(), 16);
+    let (mut on_robot, mut on_mirrored, mut joints, mut empty) = (0, 0, 0, 0);
+    for (id, sample) in samples.iter().enumerate() {
+        assert_eq!(sample.id, id as u64);
+        let colour = image_of(&request.out, &sample.image).into_rgb8();
+        let mask = image_of(&request.out, &sample.mask);
+        assert_eq!(mask.color(), image::ColorType::L8);
+        let mask = mask.into_luma8();
+        assert_eq!(colour.dimensions(), (512, 424));
+        assert_eq!(mask.dimensions(), (512, 424));
+        assert!(mask.iter().all(|&m| m == 0 || m == 255));
+        let share = mask.iter().filter(|&&m| m == 255).count() as f64 / mask.len() as f64;
+        assert!((sample.coverage - share).abs() < 1e-12);
+
+        let Some(angles) = &sample.joint_angles_rad else {
+            let text = serde_json::to_string(sample).unwrap();
+            assert!(
+                !text.contains("joint") && !text.contains("camera_from_base"),
+                "{text}"
+            );
+            assert_eq!(share, 0.0);
+            empty += 1;
+            continue;
+        };
+        assert!((0.01..0.5).contains(&share), "{share}");
+        let matrix = sample.camera_from_base.unwrap();
+        let camera_from_base =
+            DAffine3::from_mat4(glam::DMat4::from_cols_array(&matrix).transpose());
+        let origins = robot.joint_origins(&robot.link_poses(angles));
+        let metres = sample.joints_m.as_ref().unwrap();
+        let pixels = sample.joints_px.as_ref().unwrap();
+        for ((origin, &metres), pixel) in origins.iter().zip(metres).zip(pixels) {
+            assert!(
+                camera_from_base
+                    .transform_point3(*origin)
+                    .distance(metres.into())
+                    < 1e-9
+            );
+            let [u, v] = INTRINSICS.project(metres).unwrap();
+            assert!((u - pixel[0]).abs() < 1e-9 && (v - pixel[1]).abs() < 1e-9);
+            let robot_at = |u: f64, v: f64| {
+                let (u, v) = (u.round(), v.round());
+                let inside = (0.0..512.0).contains(&u) && (0.0..424.0).contains(&v);
+                inside.then(|| mask.get_pixel(u as u32, v as u32).0[0] == 255)
+            };
+            // All joints of this robot are inside its body.
+            if let Some(hit) = robot_at(u, v) {
+                joints += 1;
+                on_robot += usize::from(hit);
+                on_mirrored += usize::from(robot_at(511.0 - u, v) == Some(true));
+            }
+        }
+    }
+    assert!(
+        empty > 0 && joints > 20,
+        "{empty} without a robot, {joints} joints"
+    );
+    assert!(
+        on_robot * 10 > joints * 8,
+        "{on_robot} of {joints} joints on the mask"
+    );
+    assert!(
+        on_mirrored * 10 < joints * 8,
+        "{on_mirrored} of {joints} mirrored ones as well"
+    );
+}
+
+#[test]
+fn the_same_seed_gives_the_same_recording_even_after_a_stop() {
+    let folder = TempDir::new().unwrap();
+    backgrounds(folder.path());
+    let device = common::device();
+    let whole = request(folder.path(), "whole");
+    record(&device, &whole, |_| {}).unwrap();
+
+    let mut stopped = request(folder.path(), "stopped");
+    stopped.samples = 2;
+    record(&device, &stopped, |_| {}).unwrap();
+    let lines = stopped.out.join("samples.jsonl");
+    let half_a_line = fs::read_to_string(&lines).unwrap() + "{\"id\":2,\"ima";
+    fs::write(&lines, half_a_line).unwrap();
+    stopped.samples = 6;
+    record(&device, &stopped, |_| {}).unwrap();
+
+    let mut other = request(folder.path(), "other");
+    other.seed = 4;
+    record(&device, &other, |_| {}).unwrap();
+
+    let all = |out: &Path| {
+        let mut bytes = fs::read(out.join("samples.jsonl")).unwrap();
+        for sample in samples(out) {
+            bytes.extend(fs::read(out.join(sample.image)).unwrap());
+            bytes.extend(fs::read(out.join(sample.mask)).unwrap());
+        }
+        bytes
+    };
+    assert!(all(&whole.out) == all(&stopped.out));
+    assert!(all(&whole.out) != all(&other.out));
+}
+
+#[test]
+fn a_fixed_camera_stays_where_it_is() {
+    let folder = TempDir::new().unwrap();
+    backgrounds(folder.path());
+    let mut request = request(folder.path(), "out");
+    request.protocol = Protocol::FixedCamera;
+    record(&common::device(), &request, |_| {}).unwrap();
+    let samples = samples(&request.out);
+    assert_eq!(samples.len(), 6);
+    let first = &samples[0];
+    for sample in &samples[1..] {
+        assert!(sample.camera_from_base.is_some());
+        assert_eq!(sample.camera_from_base, first.camera_from_base);
+        assert_ne!(sample.joint_angles_rad, first.joint_angles_rad);
+    }
+}
+
+#[test]
+fn another_recording_is_not_overwritten() {
+    let folder = TempDir::new().unwrap();
+    backgrounds(folder.path());
+    let device = common::device();
+    let mut request = request(folder.path(), "out");
+    request.samples = 1;
+    record(&device, &request, |_| {}).unwrap();
+    let lines = request.out.join("samples.jsonl");
+    let before = fs::read(&lines).unwrap();
+
+    let mut other = request.clone();
+    other.seed = 99;
+    let error = record(&device, &other, |_| {}).unwrap_err();
+    assert!(
+        matches!(error, RecordingError::OutputTaken { .. }),
+        "{error}"
+    );
+    assert!(error.to_string().contains("recording.json"), "{error}");
+    assert_eq!(fs::read(&lines).unwrap(), before);
+
+    fs::write(&lines, "{\"id\":7}\n").unwrap();
+    let error = record(&device, &request, |_| {}).unwrap_err();
+    assert!(error.to_string().contains("line 1"), "{error}");
+
+    fs::remove_file(request.out.join("recording.json")).unwrap();
+    let error = record(&device, &request, |_| {}).unwrap_err();
+    assert!(
+        matches!(error, RecordingError::OutputTaken { .. }),
+        "{error}"
+    );
+}
+
+#[test]
+fn backgrounds_must_exist() {
+    let folder = TempDir::new().unwrap();
+    let device = common::device();
+    let request = request(folder.path(), "out");
+    let error = record(&device, &request, |_| {}).unwrap_err();
+    assert!(matches!(error, RecordingError::Io { .. }), "{error}");
+    fs::create_dir(&request.backgrounds).unwrap();
+    fs::write(request.backgrounds.join("a.jpg"), "no picture").unwrap();
+    let error = record(&device, &request, |_| {}).unwrap_err();
+    assert!(
+        matches!(error, RecordingError::NoBackgrounds { .. }),
+        "{error}"
+    );
+    assert!(!request.out.exists());
+}
