@@ -8,7 +8,7 @@ from safetensors.torch import load_file
 from whereabot_trainer import data, evaluate, golden
 from whereabot_trainer.__main__ import main
 from whereabot_trainer.export import choose_presence, read_model
-from whereabot_trainer.networks import JOINT_INPUT, Network, paper_joint_layers
+from whereabot_trainer.networks import JOINT_INPUT, MASK_INPUT, Network, context_mask_layers, paper_joint_layers, paper_mask_layers
 from whereabot_trainer.train import Standardised, load_network
 
 
@@ -109,7 +109,7 @@ def test_committed_golden_files_are_what_pytorch_computes(tmp_path, request):
     committed = request.config.rootpath.parent / "tests" / "data" / "golden"
     golden.write_golden(tmp_path)
     names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == sorted(path.name for path in committed.iterdir()) and len(names) == 6
+    assert names == sorted(path.name for path in committed.iterdir()) and len(names) == 8
     for name in names:
         made, kept = load_file(tmp_path / name), load_file(committed / name)
         assert made.keys() == kept.keys()
@@ -122,10 +122,10 @@ def test_committed_golden_files_are_what_pytorch_computes(tmp_path, request):
     assert (values["joints"] - load_file(committed / "tiny.activations.safetensors")["joints"]).abs().max() > 1e-5
 
 
-def test_folding_normalisation_keeps_the_function():
+@pytest.mark.parametrize("layers", [paper_mask_layers(), context_mask_layers()])
+def test_folding_normalisation_keeps_the_function(layers):
     torch.manual_seed(0)
-    network = Network(paper_joint_layers(pool=4), JOINT_INPUT, normalise=True)
-    plain = Network(paper_joint_layers(pool=4), JOINT_INPUT)
+    network, plain = Network(layers, MASK_INPUT, normalise=True), Network(layers, MASK_INPUT)
     for _ in range(3):
         network(torch.rand(4, 3, 212, 256))
     network.eval()

@@ -69,9 +69,11 @@ def main(argv=None):
     command = commands.add_parser("train-mask", help="train the mask network")
     _training_flags(command, minutes=40, batch=16, learning_rate=(3e-3, 3e-5), momentum=(0.9, 0.9),
                     dilations=(1, 2, 4, 8, 1))
+    command.add_argument("--family", choices=("paper", "context"), default="paper",
+                         help="the paper's network, or the wider one with skips (%(default)s); --dilations is the paper's alone")
     command.add_argument("--crop", nargs=2, type=int, default=(160, 128), metavar=("W", "H"),
                          help="pixels of a training crop (%(default)s)")
-    command.add_argument("--zoom", nargs=2, type=float, default=(0.7, 2.0), metavar=("LEAST", "MOST"),
+    command.add_argument("--zoom", nargs=2, type=float, default=(0.7, 1.6), metavar=("LEAST", "MOST"),
                          help="magnification of the crops (%(default)s)")
     command.set_defaults(run=_run(train.train_mask))
 

@@ -205,13 +205,13 @@ def _jitter_colours(images):
 
 def random_views(images, masks, height, width, tilt_degrees=10, zoom=(0.7, 2.0)):
     """Random crops of height x width: zoomed, tilted, and mirrored half of the time. For the mask network alone: an arm
-    is not its mirror image, and a zoom changes the camera."""
+    is not its mirror image, and a zoom changes the camera. Beyond the image it is black, as beside a photo."""
     count, _, full_height, full_width = images.shape
     step = 1 / torch.exp(_uniform(count, math.log(zoom[0]), math.log(zoom[1])))
     angle = torch.deg2rad(_uniform(count, -tilt_degrees, tilt_degrees))
     mirror = torch.where(torch.rand(count) < 0.5, -1.0, 1.0)
-    room_x = (full_width - width * step).clamp(min=0) / full_width
-    room_y = (full_height - height * step).clamp(min=0) / full_height
+    room_x = (full_width - width * step).abs() / full_width
+    room_y = (full_height - height * step).abs() / full_height
     cos, sin = torch.cos(angle) * step, torch.sin(angle) * step
     # grid_sample's coordinates run from -1 to 1 over the source's width and height.
     theta = torch.stack([
@@ -220,7 +220,7 @@ def random_views(images, masks, height, width, tilt_degrees=10, zoom=(0.7, 2.0))
     ], 1)
     grid = torch.nn.functional.affine_grid(theta, [count, 1, height, width], align_corners=False)
     both = torch.nn.functional.grid_sample(
-        torch.cat([images, masks], 1), grid, padding_mode="border", align_corners=False)
+        torch.cat([images, masks], 1), grid, align_corners=False)
     return both[:, :3], (both[:, 3:] >= 0.5).float()
 
 

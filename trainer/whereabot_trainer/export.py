@@ -15,11 +15,11 @@ from .train import Standardised, load_network
 DTYPES = {"f32": torch.float32, "f16": torch.float16}
 
 
-def describe(mask_layers, joint_layers, *, robot, overlay, presence, card,
+def describe(mask_layers, joint_layers, *, family, robot, overlay, presence, card,
              width=INPUT_WIDTH, height=INPUT_HEIGHT, camera=CAMERA):
     """The description that the engine reads from the model file."""
     return {
-        "version": 1, "family": "paper", "robot": robot, "joints": JOINTS,
+        "version": 1, "family": family, "robot": robot, "joints": JOINTS,
         "input": {"width": width, "height": height}, "camera": camera,
         "mask_network": {"layers": mask_layers}, "overlay": overlay,
         "joint_network": {"layers": joint_layers}, "presence": presence, "card": card,
@@ -130,7 +130,7 @@ def export_runs(args):
         "licence": args.licence,
     }
     description = describe(
-        mask.layers, joint.layers, robot=args.robot, overlay={"rule": "multiply"},
+        mask.layers, joint.layers, family=mask_state["card"]["family"], robot=args.robot, overlay={"rule": "multiply"},
         presence={"mask_threshold": 0.5, "min_coverage": least}, card=card)
     write_model(args.out, mask, joint, description, args.dtype)
     print(json.dumps({"presence": description["presence"], **figures}, indent=1))

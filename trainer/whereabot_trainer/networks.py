@@ -31,6 +31,37 @@ def paper_mask_layers(dilations=(1, 2, 4, 8, 1)):
     return layers
 
 
+def context_mask_layers():
+    """The context mask network: a wide view at a quarter of the resolution, upsampled, with two skips.
+
+    With a free camera the paper's mask network runs out of capacity: this one sees the whole image for two thirds of the
+    arithmetic.
+    """
+    def conv(name, source, channels, kernel=3, dilation=1, activation="relu"):
+        return {"name": name, "op": "conv2d", "inputs": [source], "out_channels": channels, "kernel": kernel,
+                "dilation": dilation, "activation": activation}
+
+    layers = [
+        conv("conv1", MASK_INPUT, 16),
+        {"name": "pool1", "op": "max_pool2d", "inputs": ["conv1"], "size": 2},
+        conv("conv2", "pool1", 32),
+        {"name": "pool2", "op": "max_pool2d", "inputs": ["conv2"], "size": 2},
+    ]
+    source = "pool2"
+    for number, dilation in enumerate((1, 2, 4, 8, 16, 1), start=3):
+        layers.append(conv(f"conv{number}", source, 64, dilation=dilation))
+        source = f"conv{number}"
+    return layers + [
+        conv("conv9", source, 32, kernel=1),
+        {"name": "up1", "op": "upsample2d", "inputs": ["conv9"], "scale": 2},
+        {"name": "skip1", "op": "concat", "inputs": ["up1", "conv2"]},
+        conv("conv10", "skip1", 32),
+        {"name": "up2", "op": "upsample2d", "inputs": ["conv10"], "scale": 2},
+        {"name": "skip2", "op": "concat", "inputs": ["up2", "conv1"]},
+        conv("conv11", "skip2", 1, activation="sigmoid"),
+    ]
+
+
 def paper_joint_layers(dilations=(1, 1, 1), pool=2, outputs=18):
     """The paper's joint network: convolutions of 32, 64 and 128 filters, max-pooling between them, and a dense layer."""
     layers, source = [], JOINT_INPUT
@@ -66,10 +97,13 @@ class Network(nn.Module):
             name, op = layer["name"], layer["op"]
             if name in shapes or hasattr(self, name):
                 raise ValueError(f"layer name {name!r} is taken")
-            (source,) = layer["inputs"]
-            if source not in shapes:
-                raise ValueError(f"layer {name!r} reads {source!r}, which no earlier layer makes")
-            channels, *size = shapes[source]
+            for source in layer["inputs"]:
+                if source not in shapes:
+                    raise ValueError(f"layer {name!r} reads {source!r}, which no earlier layer makes")
+            sources = [shapes[source] for source in layer["inputs"]]
+            if len({tuple(shape[1:]) for shape in sources}) != 1 or (len(sources) > 1) != (op == "concat"):
+                raise ValueError(f"layer {name!r}: {op} cannot read inputs of shapes {sources}")
+            channels, *size = sources[0]
             if op == "conv2d":
                 kernel, dilation = layer["kernel"], layer["dilation"]
                 self.add_module(name, nn.Conv2d(
@@ -80,10 +114,14 @@ class Network(nn.Module):
             elif op == "max_pool2d":
                 shapes[name] = (channels, *(extent // layer["size"] for extent in size))
             elif op == "dense":
-                self.add_module(name, nn.Linear(math.prod(shapes[source]), layer["out_features"]))
+                self.add_module(name, nn.Linear(math.prod(sources[0]), layer["out_features"]))
                 shapes[name] = (layer["out_features"],)
             elif op == "sigmoid":
-                shapes[name] = shapes[source]
+                shapes[name] = sources[0]
+            elif op == "upsample2d":
+                shapes[name] = (channels, *(extent * layer["scale"] for extent in size))
+            elif op == "concat":
+                shapes[name] = (sum(shape[0] for shape in sources), *size)
             else:
                 raise ValueError(f"layer {name!r} has the unknown op {op!r}")
         self.shapes = shapes
@@ -106,6 +144,11 @@ class Network(nn.Module):
                     value = getattr(self, name)(value.float().flatten(1))
             elif op == "sigmoid":
                 value = torch.sigmoid(value.float())
+            elif op == "upsample2d":
+                value = nn.functional.interpolate(
+                    value, scale_factor=layer["scale"], mode="bilinear", align_corners=False)
+            elif op == "concat":
+                value = torch.cat([values[source] for source in layer["inputs"]], 1)
             activation = layer.get("activation", "none")
             if activation == "relu":
                 value = torch.relu(value)

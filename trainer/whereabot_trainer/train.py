@@ -11,7 +11,7 @@ import torch
 from tqdm import tqdm
 
 from . import data, evaluate, losses
-from .networks import JOINT_INPUT, JOINTS, MASK_INPUT, Network, paper_joint_layers, paper_mask_layers
+from .networks import JOINT_INPUT, JOINTS, MASK_INPUT, Network, context_mask_layers, paper_joint_layers, paper_mask_layers
 
 
 # --- the loop --------------------------------------------------------------------------------------------------------
@@ -183,8 +183,9 @@ def train_mask(args):
     share = float(samples.coverage[numbers].mean())
     w_fg, w_bg = losses.class_weights(share)
     height, width = args.crop[1], args.crop[0]
-    card |= {"foreground_share": share, "w_fg": w_fg, "w_bg": w_bg, "crop": args.crop, "zoom": args.zoom}
-    network = initialise(Network(paper_mask_layers(args.dilations), MASK_INPUT, normalise=args.normalise))
+    card |= {"family": args.family, "foreground_share": share, "w_fg": w_fg, "w_bg": w_bg, "crop": args.crop, "zoom": args.zoom}
+    layers = context_mask_layers() if args.family == "context" else paper_mask_layers(args.dilations)
+    network = initialise(Network(layers, MASK_INPUT, normalise=args.normalise))
     network = network.to(args.device, memory_format=torch.channels_last)
 
     def batch_loss(batch, _progress):
