@@ -75,6 +75,10 @@ def main(argv=None):
                          help="pixels of a training crop (%(default)s)")
     command.add_argument("--zoom", nargs=2, type=float, default=(0.7, 1.6), metavar=("LEAST", "MOST"),
                          help="magnification of the crops (%(default)s)")
+    command.add_argument("--negatives", nargs="+", metavar="DIR",
+                         help="folders of photographs without a robot, to train on beside the recordings")
+    command.add_argument("--negative-share", type=float, default=0.15, metavar="SHARE",
+                         help="share of training samples that are such photographs (%(default)s)")
     command.set_defaults(run=_run(train.train_mask))
 
     command = commands.add_parser("train-joint", help="train the joint network")

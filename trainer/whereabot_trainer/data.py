@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, ImageOps
 from tqdm import tqdm
 
 from .networks import CAMERA, INPUT_HEIGHT, INPUT_WIDTH, JOINTS
@@ -165,6 +165,24 @@ class Samples:
         return torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255, torch.from_numpy(masks)[:, None].float()
 
 
+def read_negatives(folders, cache):
+    """Photographs without a robot as uint8 [N, 3, 212, 256], cut to fill the networks' input; decoded once."""
+    paths = sorted(path for folder in folders for path in Path(folder).resolve().iterdir()
+                   if path.suffix.lower() in {".jpg", ".jpeg", ".png", ".webp"})
+    if not paths:
+        raise RecordingError(f"no photographs in {', '.join(map(str, folders))}")
+    names = "\n".join(map(str, paths))
+    stored = Path(cache) / f"negatives-{hashlib.sha256(names.encode()).hexdigest()[:8]}.npy"
+    if not stored.exists():
+        stored.parent.mkdir(parents=True, exist_ok=True)
+        pictures = []
+        for path in tqdm(paths, "decoding photographs", mininterval=5):
+            with Image.open(path) as file:
+                pictures.append(np.asarray(ImageOps.fit(file.convert("RGB"), (INPUT_WIDTH, INPUT_HEIGHT))))
+        np.save(stored, np.stack(pictures).transpose(0, 3, 1, 2))
+    return torch.from_numpy(np.load(stored))
+
+
 def split(samples, seed, validation_share=0.2):
     """(training, validation) numbers, at random by seed.
 
@@ -203,9 +221,10 @@ def _jitter_colours(images):
     return images.clamp(0, 1)
 
 
-def random_views(images, masks, height, width, tilt_degrees=10, zoom=(0.7, 2.0)):
-    """Random crops of height x width: zoomed, tilted, and mirrored half of the time. For the mask network alone: an arm
-    is not its mirror image, and a zoom changes the camera. Beyond the image it is black, as beside a photo."""
+def random_views(images, masks, height, width, tilt_degrees=10, zoom=(0.7, 1.6)):
+    """Random views of height x width: zoomed, tilted, and mirrored half of the time. For the mask network alone: an arm
+    is not its mirror image, and a zoom changes the camera. Beyond the image it is reflected, or at times black, as
+    beside a portrait photo."""
     count, _, full_height, full_width = images.shape
     step = 1 / torch.exp(_uniform(count, math.log(zoom[0]), math.log(zoom[1])))
     angle = torch.deg2rad(_uniform(count, -tilt_degrees, tilt_degrees))
@@ -219,8 +238,12 @@ def random_views(images, masks, height, width, tilt_degrees=10, zoom=(0.7, 2.0))
         torch.stack([mirror * sin * width / full_height, cos * height / full_height, room_y * _uniform(count, -1, 1)], 1),
     ], 1)
     grid = torch.nn.functional.affine_grid(theta, [count, 1, height, width], align_corners=False)
-    both = torch.nn.functional.grid_sample(
-        torch.cat([images, masks], 1), grid, align_corners=False)
+    both = torch.cat([images, masks], 1)
+    # Sampled further apart than this, single pixels would alias.
+    shrunk = step > 1.5
+    both[shrunk] = torch.nn.functional.avg_pool2d(both[shrunk], 3, 1, 1, count_include_pad=False)
+    padding = "zeros" if torch.rand(()) < 0.1 else "reflection"
+    both = torch.nn.functional.grid_sample(both, grid, padding_mode=padding, align_corners=False)
     return both[:, :3], (both[:, 3:] >= 0.5).float()
 
 

@@ -143,6 +143,7 @@ def _rate(hits):
 
 def _training(state):
     keep = ("protocol", "seed", "precision", "optimizer", "learning_rate", "momentum", "batch", "normalise", "samples", "crop", "zoom",
+            "family", "negatives", "negative_share",
             "foreground_share", "w_fg", "w_bg", "estimated_masks", "estimated_after")
     return {key: state["card"][key] for key in keep if key in state["card"]} | {
         "minutes": round(state["seconds"] / 60, 1), "iterations": state["iteration"],

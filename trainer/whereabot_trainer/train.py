@@ -188,8 +188,17 @@ def train_mask(args):
     network = initialise(Network(layers, MASK_INPUT, normalise=args.normalise))
     network = network.to(args.device, memory_format=torch.channels_last)
 
+    negatives = data.read_negatives(args.negatives, args.cache) if args.negatives else None
+    if negatives is not None:
+        card |= {"negatives": len(negatives), "negative_share": args.negative_share}
+
     def batch_loss(batch, _progress):
-        images, masks = (tensor.to(args.device) for tensor in samples.pixels(batch))
+        images, masks = samples.pixels(batch)
+        if negatives is not None:
+            rows = torch.rand(len(batch), device="cpu") < args.negative_share
+            drawn = torch.randint(len(negatives), (int(rows.sum()),), device="cpu")
+            images[rows], masks[rows] = negatives[drawn].float() / 255, 0.0
+        images, masks = images.to(args.device), masks.to(args.device)
         images, masks = data.random_views(images, masks, height, width, zoom=args.zoom)
         images = data.jitter_colours(images)
         estimate = network(images.contiguous(memory_format=torch.channels_last))
