@@ -87,7 +87,8 @@ def _decode(folder, number, sample):
             mask = np.asarray(file.convert("L"))
         for key, shape in (("image", image.shape[:2]), ("mask", mask.shape)):
             if shape != (2 * INPUT_HEIGHT, 2 * INPUT_WIDTH):
-                raise ValueError(f"{key}: expected {2 * INPUT_WIDTH}x{2 * INPUT_HEIGHT} pixels, found {shape[1]}x{shape[0]}")
+                raise ValueError(
+                    f"{key}: expected {2 * INPUT_WIDTH}x{2 * INPUT_HEIGHT} pixels, found {shape[1]}x{shape[0]}")
     except (OSError, ValueError) as error:
         raise RecordingError(f"{folder / 'samples.jsonl'}: line {number}: {error}") from error
     return halve(image), (halve(mask) >= 128).astype(np.uint8)
@@ -229,13 +230,13 @@ def random_views(images, masks, height, width, tilt_degrees=10, zoom=(0.7, 1.6))
     step = 1 / torch.exp(_uniform(count, math.log(zoom[0]), math.log(zoom[1])))
     angle = torch.deg2rad(_uniform(count, -tilt_degrees, tilt_degrees))
     mirror = torch.where(torch.rand(count) < 0.5, -1.0, 1.0)
-    room_x = (full_width - width * step).abs() / full_width
-    room_y = (full_height - height * step).abs() / full_height
     cos, sin = torch.cos(angle) * step, torch.sin(angle) * step
+    shift_x = (full_width - width * step).abs() / full_width * _uniform(count, -1, 1)
+    shift_y = (full_height - height * step).abs() / full_height * _uniform(count, -1, 1)
     # grid_sample's coordinates run from -1 to 1 over the source's width and height.
     theta = torch.stack([
-        torch.stack([mirror * cos * width / full_width, -sin * height / full_width, room_x * _uniform(count, -1, 1)], 1),
-        torch.stack([mirror * sin * width / full_height, cos * height / full_height, room_y * _uniform(count, -1, 1)], 1),
+        torch.stack([mirror * cos * width / full_width, -sin * height / full_width, shift_x], 1),
+        torch.stack([mirror * sin * width / full_height, cos * height / full_height, shift_y], 1),
     ], 1)
     grid = torch.nn.functional.affine_grid(theta, [count, 1, height, width], align_corners=False)
     both = torch.cat([images, masks], 1)
@@ -265,7 +266,7 @@ def rotate_camera(images, joints, rotations, camera=CAMERA):
     count, _, height, width = images.shape
     k = torch.tensor([[camera["fx"], 0, camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1]])
     back = k @ rotations.mT @ torch.linalg.inv(k)
-    v, u = torch.meshgrid(torch.arange(height, dtype=torch.float32), torch.arange(width, dtype=torch.float32), indexing="ij")
+    v, u = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
     source = torch.stack([u, v, torch.ones_like(u)], -1).reshape(-1, 3) @ back.mT
     source = source[..., :2] / source[..., 2:]
     # Pixel centres are whole numbers here; grid_sample's -1 and 1 are the image's outer edges.

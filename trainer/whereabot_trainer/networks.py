@@ -34,8 +34,8 @@ def paper_mask_layers(dilations=(1, 2, 4, 8, 1)):
 def context_mask_layers():
     """The context mask network: a wide view at a quarter of the resolution, upsampled, with two skips.
 
-    With a free camera the paper's mask network runs out of capacity: this one sees the whole image for two thirds of the
-    arithmetic.
+    With a free camera the paper's mask network runs out of capacity: this one sees the whole image, for two thirds of
+    the arithmetic.
     """
     def conv(name, source, channels, kernel=3, dilation=1, activation="relu"):
         return {"name": name, "op": "conv2d", "inputs": [source], "out_channels": channels, "kernel": kernel,
@@ -63,7 +63,7 @@ def context_mask_layers():
 
 
 def paper_joint_layers(dilations=(1, 1, 1), pool=2, outputs=18):
-    """The paper's joint network: convolutions of 32, 64 and 128 filters, max-pooling between them, and a dense layer."""
+    """The paper's joint network: convolutions of 32, 64 and 128 filters, max-pooling between, and a dense layer."""
     layers, source = [], JOINT_INPUT
     for number, (filters, dilation) in enumerate(zip((32, 64, 128), dilations, strict=True), start=1):
         layers.append({
@@ -165,7 +165,7 @@ class Network(nn.Module):
 
     @torch.no_grad()
     def fold_normalisation(self):
-        """Multiplies each batch normalisation, as it is in eval mode, into its convolution: the same function without it."""
+        """Multiplies each batch normalisation, as it is in eval mode, into its convolution."""
         for layer in self.layers if self.normalise else []:
             norm = self._modules.pop(f"{layer['name']}_norm", None)
             if norm is not None:
