@@ -8,7 +8,8 @@ from safetensors.torch import load_file
 from whereabot_trainer import data, evaluate, golden
 from whereabot_trainer.__main__ import main
 from whereabot_trainer.export import choose_presence, read_model
-from whereabot_trainer.networks import JOINT_INPUT, MASK_INPUT, Network, context_mask_layers, paper_joint_layers, paper_mask_layers
+from whereabot_trainer.networks import (
+    JOINT_INPUT, MASK_INPUT, Network, context_mask_layers, paper_joint_layers, paper_mask_layers)
 from whereabot_trainer.train import Standardised, load_network
 
 

@@ -136,7 +136,7 @@ def export_runs(args):
         mask.layers, joint.layers, family=mask_state["card"]["family"], robot=args.robot, overlay=rule,
         presence={"mask_threshold": 0.5, "min_coverage": least}, card=card)
     write_model(args.out, mask, joint, description, args.dtype)
-    print(json.dumps({"presence": description["presence"], **figures}, indent=1))
+    print(json.dumps({"chosen": description["presence"], "figures": figures}, indent=1))
     print(f"{args.out}: {os.path.getsize(args.out) / 1e6:.2f} MB")
 
 
