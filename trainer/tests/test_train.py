@@ -81,10 +81,12 @@ def test_export_folds_calibration_and_standardisation(train, recording, tmp_path
     assert not torch.allclose(joint(images), trained_joint(images), atol=1e-2)
 
 
-def test_presence_threshold_parts_the_two_kinds():
-    assert choose_presence([0.05, 0.08, 0.2], [0.0, 0.01, 0.002]) == (pytest.approx(0.0101), 1.0, 1.0)
-    least, passed, rejected = choose_presence([0.05, 0.08, 0.2], [0.0, 0.06, 0.002])
-    assert passed + rejected == pytest.approx(5 / 3), least
+def test_presence_threshold_rejects_nine_of_ten():
+    without = [0.0] * 7 + [0.01, 0.02, 0.3]
+    least = choose_presence(without)
+    assert least == pytest.approx(0.0201, abs=1e-4) and sum(value < least for value in without) == 9
+    assert choose_presence(without, rejected=1.0) > 0.3
+    assert choose_presence([]) == 0.001
 
 
 def test_calibration_finds_the_best_threshold():

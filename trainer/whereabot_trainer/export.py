@@ -1,6 +1,7 @@
 """The model file: both networks' tensors and, in the metadata key `whereabot`, the JSON that describes them."""
 
 import json
+import math
 import os
 
 import numpy as np
@@ -58,16 +59,13 @@ def read_model(path):
 
 # --- from training runs to a model file ------------------------------------------------------------------------------
 
-def choose_presence(robot, without):
-    """The least mask coverage at which a robot counts as seen: the value that passes the most robots and rejects the
-    most images without one, the two rates weighed equally. `robot` and `without` are coverages."""
-    robot, without = np.asarray(robot), np.asarray(without)
+def choose_presence(without, rejected=0.9):
+    """The least mask coverage at which a robot counts as seen: the smallest that rejects this share of the images
+    without one, given by the coverages of their masks; so as few small robots as possible are missed."""
+    without = np.sort(without)
+    least = without[math.ceil(rejected * len(without)) - 1] if len(without) else 0.0
     # Below a thousandth of the image (54 pixels) nothing can be said about a robot's joints.
-    candidates = np.unique(np.concatenate([[0.001], np.round(np.concatenate([robot, without]) + 1e-4, 4)]))
-    candidates = candidates[candidates >= 0.001]
-    merit = [(robot >= least).mean() + (without < least).mean() for least in candidates]
-    least = float(candidates[int(np.argmax(merit))])
-    return least, float((robot >= least).mean()), float((without < least).mean())
+    return max(0.001, math.ceil(least * 1e4 + 1) / 1e4)
 
 
 def export_runs(args):
@@ -98,8 +96,7 @@ def export_runs(args):
     photos_without = {}
     for folder in args.photos_without:
         photos_without |= photos.coverages(mask, folder)
-    least, _, _ = choose_presence(
-        [coverage[n] for n in chosen if seen[n]], without + list(photos_without.values()))
+    least = choose_presence(without + list(photos_without.values()))
 
     robots = reported[seen[reported]]
     measured = evaluate.score_mask(mask, samples, reported, args.device)
