@@ -11,3 +11,8 @@ pub mod network;
 #[cfg(feature = "recording")]
 pub mod recording;
 pub mod reference;
+
+/// The library's example in the README is compiled with the tests.
+#[cfg(all(doctest, feature = "cli"))]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -5,8 +5,9 @@ mod common;
 
 use common::{description, device, difference, model_file, noise};
 use image::RgbaImage;
-use whereabot::camera::Camera;
+use whereabot::camera::{Camera, Rectification};
 use whereabot::cascade::{Estimate, Locator, Output, Status};
+use whereabot::gpu::{Frame, GpuError, Plan};
 use whereabot::network::Model;
 
 const ALL: Output = Output {
@@ -82,4 +83,124 @@ fn another_picture_is_noticed() {
     let again = locator.locate(&picture(512, 424, 1), &camera, ALL).unwrap();
     assert!(difference(mask(&first), mask(&second)).unwrap() > 1e-3);
     assert_eq!(first, again);
+}
+
+#[test]
+fn a_batch_gives_what_single_images_give() {
+    let model = Model::from_bytes(&model_file(&description(48, 40, 5), 4), "random").unwrap();
+    let device = device();
+    let sizes = [(48, 40), (61, 33), (100, 90)];
+    let frames = |batch: &[(u32, u32)]| -> Vec<Frame> {
+        let mut plan = Plan::new(&device, &model, batch.len()).unwrap();
+        for (index, &(width, height)) in batch.iter().enumerate() {
+            let camera = Camera::from_hfov(width, height, 1.2);
+            let image = picture(width, height, width.into());
+            let params = Rectification::new(&camera, &model.description.camera, 48, 40);
+            plan.write(&device, index, &image, &params).unwrap();
+        }
+        plan.run(&device, true, true).unwrap()
+    };
+    let together = frames(&sizes);
+    assert_eq!(together.len(), 3);
+    for (size, frame) in sizes.iter().zip(&together) {
+        let alone = frames(&[*size]);
+        assert_eq!(alone[0].coverage, frame.coverage);
+        assert!(difference(&alone[0].mask, &frame.mask).unwrap() <= 1e-6);
+        assert!(difference(&alone[0].joints, &frame.joints).unwrap() <= 1e-6);
+    }
+    // Negative control: the images differ.
+    assert!(difference(&together[0].mask, &together[1].mask).unwrap() > 1e-3);
+    assert!(matches!(
+        Plan::new(&device, &model, 1).unwrap().write(
+            &device,
+            1,
+            &picture(48, 40, 1),
+            &Rectification::new(
+                &Camera::from_hfov(48, 40, 1.0),
+                &model.description.camera,
+                48,
+                40
+            )
+        ),
+        Err(GpuError::Size { .. })
+    ));
+}
+
+#[test]
+fn only_what_was_asked_for_is_answered() {
+    let model = Model::from_bytes(&model_file(&description(48, 40, 5), 4), "random").unwrap();
+    let camera = Camera::from_hfov(48, 40, 1.2);
+    let image = picture(48, 40, 1);
+    for mut locator in [
+        Locator::on_gpu(device(), &model).unwrap(),
+        Locator::on_cpu(&model),
+    ] {
+        let mask_only = Output {
+            mask: false,
+            mask_only: true,
+        };
+        let found = locator.locate(&image, &camera, mask_only).unwrap();
+        assert!(found.joints.is_empty() && found.mask.is_none());
+        let all = locator.locate(&image, &camera, ALL).unwrap();
+        assert_eq!(all.mask.unwrap().probability.len(), 48 * 40);
+    }
+}
+
+/// A model whose mask is `value` everywhere, and whose joints are `joint` metres in x, y and z.
+fn constant(value: f32, joint: f32) -> Model {
+    let description = description(48, 40, 4);
+    let bytes = model_file(&description, 1);
+    let mut model = Model::from_bytes(&bytes, "constant").unwrap();
+    let fill = |network: &whereabot::network::Network, input: &str, last: f32| {
+        let layers: Vec<_> = network.nodes().iter().map(|n| n.layer.clone()).collect();
+        let count_with_parameters = network
+            .nodes()
+            .iter()
+            .filter(|n| n.parameters.is_some())
+            .count();
+        let mut index = 0;
+        whereabot::network::Network::new(input, network.input(), layers, |_, weight, bias| {
+            index += 1;
+            Ok(whereabot::network::Parameters {
+                weight: vec![0.0; weight.iter().product()],
+                bias: vec![
+                    if index == count_with_parameters {
+                        last
+                    } else {
+                        0.0
+                    };
+                    bias[0]
+                ],
+            })
+        })
+        .unwrap()
+    };
+    model.mask_network = fill(&model.mask_network, "image", (value / (1.0 - value)).ln());
+    model.joint_network = fill(&model.joint_network, "overlay", joint);
+    model
+}
+
+#[test]
+fn what_is_no_result_is_not_reported_as_one() {
+    let camera = Camera::from_hfov(48, 40, 1.2);
+    let image = picture(48, 40, 1);
+    let cases = [
+        (constant(0.9, 2.0), Status::Found),
+        // No mask: no robot, whatever the joint network says.
+        (constant(0.1, 2.0), Status::NotFound),
+        // Joints behind the camera, and joints that are no numbers.
+        (constant(0.9, -2.0), Status::Invalid),
+        (constant(0.9, f32::NAN), Status::Invalid),
+        (constant(f32::NAN, 2.0), Status::Invalid),
+    ];
+    for (model, status) in cases {
+        for mut locator in [
+            Locator::on_gpu(device(), &model).unwrap(),
+            Locator::on_cpu(&model),
+        ] {
+            let found = locator.locate(&image, &camera, Output::default()).unwrap();
+            assert_eq!(found.status, status);
+            assert_eq!(found.joints.is_empty(), status != Status::Found);
+        }
+    }
 }

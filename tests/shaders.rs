@@ -9,7 +9,8 @@ use naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
 use naga::{Module, ShaderStage};
 
 /// One for each file in `shaders/`: a kernel that nobody lists is not tested.
-const KERNELS: [&str; 8] = [
+const KERNELS: [&str; 10] = [
+    "concat",
     "conv2d",
     "coverage",
     "dense",
@@ -18,6 +19,7 @@ const KERNELS: [&str; 8] = [
     "rectify",
     "render",
     "sigmoid",
+    "upsample2d",
 ];
 
 fn source(name: &str) -> String {

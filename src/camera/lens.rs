@@ -289,7 +289,7 @@ fn invert(target: f64, upper: f64, f: impl Fn(f64) -> (f64, f64)) -> Option<f64>
             low = argument;
         }
         let newton = argument - (value - target) / slope;
-        let next = if newton > low && newton < high {
+        let next = if (low..=high).contains(&newton) {
             newton
         } else {
             0.5 * (low + high)

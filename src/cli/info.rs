@@ -141,7 +141,8 @@ fn options(operation: &Operation) -> String {
             out_features,
             activation: a,
         } => format!("to {out_features}{}", activation(a)),
-        Operation::Sigmoid => String::new(),
+        Operation::Upsample2d { scale } => format!("x {scale}"),
+        Operation::Sigmoid | Operation::Concat => String::new(),
     }
 }
 

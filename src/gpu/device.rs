@@ -219,7 +219,8 @@ impl Device {
             let _ = sender.send(result);
         });
         self.wait()?;
-        match receiver.try_recv() {
+        // Where threads share the device, another one's wait may be the one that runs the callback.
+        match receiver.recv_timeout(Self::TIMEOUT) {
             Ok(Ok(())) => {}
             Ok(Err(e)) => return Err(GpuError::Lost(e.to_string())),
             Err(_) => return Err(GpuError::Timeout(Self::TIMEOUT)),

@@ -1,6 +1,7 @@
 //! The layers of a network as compute kernels on wgpu.
 
 mod adapter;
+mod concat;
 mod conv2d;
 mod coverage;
 mod dense;
@@ -14,6 +15,7 @@ mod rectify;
 mod sigmoid;
 mod step;
 mod tensor;
+mod upsample2d;
 
 pub use adapter::{AdapterReport, AdapterRequest, Choice, Wanted, list_adapters};
 pub use coverage::{Totals, coverage};

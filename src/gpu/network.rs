@@ -1,9 +1,11 @@
+use super::concat::concat;
 use super::conv2d::conv2d;
 use super::dense::dense;
 use super::max_pool2d::max_pool2d;
 use super::sigmoid::sigmoid;
 use super::step::Step;
 use super::tensor::Tensor;
+use super::upsample2d::upsample2d;
 use super::{Device, GpuError};
 use crate::network::{Network, NetworkError, Node, Operation, Parameters, Source};
 
@@ -41,10 +43,15 @@ impl NetworkPlan {
             for node in network.nodes() {
                 let label = format!("{name}.{}", node.layer.name);
                 let output = Tensor::new(device, &label, node.output, input.batch)?;
-                let source = match node.sources.first() {
-                    Some(Source::Layer(index)) => outputs.get(*index).unwrap_or(input),
-                    Some(Source::Input) | None => input,
-                };
+                let sources: Vec<&Tensor> = node
+                    .sources
+                    .iter()
+                    .map(|source| match source {
+                        Source::Layer(index) => outputs.get(*index).unwrap_or(input),
+                        Source::Input => input,
+                    })
+                    .collect();
+                let source = sources.first().copied().unwrap_or(input);
                 match node.layer.operation {
                     Operation::Conv2d {
                         kernel,
@@ -71,6 +78,10 @@ impl NetworkPlan {
                         activation,
                     )?),
                     Operation::Sigmoid => steps.push(sigmoid(device, &label, source, &output)?),
+                    Operation::Upsample2d { scale } => {
+                        steps.push(upsample2d(device, &label, source, &output, scale)?);
+                    }
+                    Operation::Concat => steps.extend(concat(device, &label, &sources, &output)?),
                 }
                 outputs.push(output);
             }

@@ -27,7 +27,7 @@ pub struct Node {
     pub layer: Layer,
     /// Where it reads from, one for each input; always earlier in the list.
     pub sources: Vec<Source>,
-    /// Shape of its (first) input.
+    /// Shape of its first input.
     pub input: Shape,
     /// Shape of its output.
     pub output: Shape,
@@ -66,13 +66,20 @@ impl Network {
                 layer: layer.name.clone(),
                 problem,
             };
-            let source_name = layer.single_input()?;
-            let &(source, shape) = known.get(source_name).ok_or_else(|| {
-                wrong(format!(
-                    "inputs: expected the network's input `{input_name}` or an earlier layer, found `{source_name}`"
-                ))
-            })?;
-            let result = layer.operation.output_shape(shape).map_err(wrong)?;
+            let mut sources = Vec::with_capacity(layer.inputs.len());
+            let mut shapes = Vec::with_capacity(layer.inputs.len());
+            for name in &layer.inputs {
+                let &(source, shape) = known.get(name).ok_or_else(|| {
+                    wrong(format!(
+                        "inputs: expected the network's input `{input_name}` or an earlier layer, found `{name}`"
+                    ))
+                })?;
+                sources.push(source);
+                shapes.push(shape);
+            }
+            let result = layer.operation.output_shape(&shapes).map_err(wrong)?;
+            // Every operation has at least one input, or has just been refused.
+            let shape = shapes.first().copied().unwrap_or(input);
             // Geometry is 32-bit in the kernels.
             if result
                 .checked_len()
@@ -97,7 +104,7 @@ impl Network {
             let name = layer.name.clone();
             nodes.push(Node {
                 layer,
-                sources: vec![source],
+                sources,
                 input: shape,
                 output: result,
                 parameters: values,

@@ -1,6 +1,6 @@
 use serde::{Deserialize, Serialize};
 
-use super::{NetworkError, Shape};
+use super::Shape;
 
 /// What a layer applies to each value after its sum.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
@@ -46,6 +46,13 @@ pub enum Operation {
     },
     /// `1 / (1 + exp(-x))` of each value.
     Sigmoid,
+    /// Bilinear enlargement, pixel centres aligned as areas (PyTorch's `align_corners=False`).
+    Upsample2d {
+        /// Factor of height and width.
+        scale: usize,
+    },
+    /// The channels of two or more inputs of one height and width, one after the other.
+    Concat,
 }
 
 impl Operation {
@@ -56,11 +63,30 @@ impl Operation {
             Self::MaxPool2d { .. } => "max_pool2d",
             Self::Dense { .. } => "dense",
             Self::Sigmoid => "sigmoid",
+            Self::Upsample2d { .. } => "upsample2d",
+            Self::Concat => "concat",
         }
     }
 
-    /// The output's shape for an input of shape `input`, or what is wrong with the operation.
-    pub(super) fn output_shape(&self, input: Shape) -> Result<Shape, String> {
+    /// The output's shape for inputs of these shapes, or what is wrong with the operation.
+    pub(super) fn output_shape(&self, inputs: &[Shape]) -> Result<Shape, String> {
+        let (&input, others) = match (self, inputs) {
+            (Self::Concat, [first, others @ ..]) if !others.is_empty() => (first, others),
+            (Self::Concat, _) => {
+                return Err(format!(
+                    "inputs: expected two or more for concat, found {}",
+                    inputs.len()
+                ));
+            }
+            (_, [input]) => (input, &[][..]),
+            _ => {
+                return Err(format!(
+                    "inputs: expected one for {}, found {}",
+                    self.name(),
+                    inputs.len()
+                ));
+            }
+        };
         let positive = |what: &str, value: usize| {
             if value == 0 {
                 Err(format!("{what}: expected at least 1, found 0"))
@@ -111,6 +137,30 @@ impl Operation {
                 Ok(Shape::new(out_features, 1, 1))
             }
             Self::Sigmoid => Ok(input),
+            Self::Upsample2d { scale } => {
+                positive("scale", scale)?;
+                let enlarged = |side: usize| {
+                    side.checked_mul(scale)
+                        .ok_or_else(|| format!("scale: expected a smaller one, found {scale}"))
+                };
+                Ok(Shape::new(
+                    input.channels,
+                    enlarged(input.height)?,
+                    enlarged(input.width)?,
+                ))
+            }
+            Self::Concat => {
+                let mut channels = input.channels;
+                for other in others {
+                    if (other.height, other.width) != (input.height, input.width) {
+                        return Err(format!(
+                            "inputs: expected one height and width, found {input} and {other}"
+                        ));
+                    }
+                    channels += other.channels;
+                }
+                Ok(Shape::new(channels, input.height, input.width))
+            }
         }
     }
 
@@ -129,7 +179,7 @@ impl Operation {
             Self::Dense { out_features, .. } => {
                 Some((vec![out_features, input.len()], vec![out_features]))
             }
-            Self::MaxPool2d { .. } | Self::Sigmoid => None,
+            Self::MaxPool2d { .. } | Self::Sigmoid | Self::Upsample2d { .. } | Self::Concat => None,
         }
     }
 
@@ -142,7 +192,7 @@ impl Operation {
                 ..
             } => (input.len() * out_channels * kernel * kernel) as u64,
             Self::Dense { out_features, .. } => (input.len() * out_features) as u64,
-            Self::MaxPool2d { .. } | Self::Sigmoid => 0,
+            Self::MaxPool2d { .. } | Self::Sigmoid | Self::Upsample2d { .. } | Self::Concat => 0,
         }
     }
 }
@@ -157,23 +207,6 @@ pub struct Layer {
     pub inputs: Vec<String>,
     /// What it computes.
     pub operation: Operation,
-}
-
-impl Layer {
-    /// The one input of an operation that takes one.
-    pub(super) fn single_input(&self) -> Result<&str, NetworkError> {
-        match self.inputs.as_slice() {
-            [input] => Ok(input),
-            inputs => Err(NetworkError::Layer {
-                layer: self.name.clone(),
-                problem: format!(
-                    "inputs: expected one for {}, found {}",
-                    self.operation.name(),
-                    inputs.len()
-                ),
-            }),
-        }
-    }
 }
 
 /// A layer as a model file has it. A field that an operation does not know is an error: to ignore
@@ -203,6 +236,16 @@ enum LayerRecord {
         activation: Activation,
     },
     Sigmoid {
+        name: String,
+        inputs: Vec<String>,
+    },
+    #[serde(rename = "upsample2d")]
+    Upsample2d {
+        name: String,
+        inputs: Vec<String>,
+        scale: usize,
+    },
+    Concat {
         name: String,
         inputs: Vec<String>,
     },
@@ -245,6 +288,12 @@ impl From<LayerRecord> for Layer {
                 },
             ),
             LayerRecord::Sigmoid { name, inputs } => (name, inputs, Operation::Sigmoid),
+            LayerRecord::Upsample2d {
+                name,
+                inputs,
+                scale,
+            } => (name, inputs, Operation::Upsample2d { scale }),
+            LayerRecord::Concat { name, inputs } => (name, inputs, Operation::Concat),
         };
         Self {
             name,

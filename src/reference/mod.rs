@@ -3,6 +3,7 @@
 //!
 //! Activations are `[channel, row, column]`, as PyTorch has them, for one image.
 
+mod concat;
 mod conv2d;
 mod coverage;
 mod dense;
@@ -11,7 +12,9 @@ mod network;
 mod overlay;
 mod rectify;
 mod sigmoid;
+mod upsample2d;
 
+pub use concat::concat;
 pub use conv2d::conv2d;
 pub use coverage::coverage;
 pub use dense::dense;
@@ -20,6 +23,7 @@ pub use network::{run, run_all};
 pub use overlay::overlay;
 pub use rectify::rectify;
 pub use sigmoid::sigmoid;
+pub use upsample2d::upsample2d;
 
 use crate::network::{Activation, Shape};
 

@@ -1,4 +1,4 @@
-use super::{Tensor, conv2d, dense, max_pool2d, sigmoid};
+use super::{Tensor, concat, conv2d, dense, max_pool2d, sigmoid, upsample2d};
 use crate::network::{Network, Operation, Source};
 
 /// The output of `network` for `input`, whose shape must be the network's; `None` where it is not.
@@ -13,10 +13,15 @@ pub fn run_all(network: &Network, input: &Tensor) -> Option<Vec<Tensor>> {
     }
     let mut outputs: Vec<Tensor> = Vec::with_capacity(network.nodes().len());
     for node in network.nodes() {
-        let source = match node.sources.first()? {
-            Source::Input => input,
-            Source::Layer(index) => outputs.get(*index)?,
-        };
+        let sources = node
+            .sources
+            .iter()
+            .map(|source| match source {
+                Source::Input => Some(input),
+                Source::Layer(index) => outputs.get(*index),
+            })
+            .collect::<Option<Vec<_>>>()?;
+        let source = *sources.first()?;
         let output = match node.layer.operation {
             Operation::Conv2d {
                 kernel,
@@ -35,6 +40,8 @@ pub fn run_all(network: &Network, input: &Tensor) -> Option<Vec<Tensor>> {
                 dense(source, node.parameters.as_ref()?, activation)
             }
             Operation::Sigmoid => sigmoid(source),
+            Operation::Upsample2d { scale } => upsample2d(source, scale),
+            Operation::Concat => concat(&sources),
         };
         outputs.push(output);
     }

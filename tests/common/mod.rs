@@ -53,7 +53,12 @@ pub fn one_layer(operation: Operation, input: Shape, seed: u64) -> Network {
         inputs: vec!["input".into()],
         operation,
     };
-    Network::new("input", input, vec![layer], |_, weight, bias| {
+    network(vec![layer], input, seed)
+}
+
+/// A network of these layers with random parameters; its input is named `input`.
+pub fn network(layers: Vec<Layer>, input: Shape, seed: u64) -> Network {
+    Network::new("input", input, layers, |_, weight, bias| {
         let len: usize = weight.iter().product();
         let scale = (3.0 * weight[0] as f32 / len as f32).sqrt();
         Ok(Parameters {
@@ -117,14 +122,20 @@ pub fn with_one_weight_changed(network: &Network, change: f32) -> Network {
 
 /// Holds the GPU's layer to the reference.
 pub fn check_layer(operation: Operation, input: Shape, batch: usize, seed: u64, tolerance: f32) {
-    let network = one_layer(operation, input, seed);
+    check_network(&one_layer(operation, input, seed), batch, seed, tolerance);
+}
+
+/// Holds the GPU's network to the reference.
+pub fn check_network(network: &Network, batch: usize, seed: u64, tolerance: f32) {
+    let input = network.input();
     let values = noise(batch * input.len(), seed + 2);
-    let gpu = on_gpu(&network, batch, &values);
-    let expected = on_reference(&network, &values);
+    let gpu = on_gpu(network, batch, &values);
+    let expected = on_reference(network, &values);
     let found = difference(&gpu, &expected).unwrap();
+    let last = &network.nodes().last().unwrap().layer;
     assert!(
         found <= tolerance,
-        "{operation:?} {input} x {batch}: differs by {found}, allowed {tolerance}"
+        "{last:?} on {input} x {batch}: differs by {found}, allowed {tolerance}"
     );
 }
 
