@@ -3,6 +3,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from whereabot_trainer import data
 from whereabot_trainer.networks import CAMERA, INPUT_HEIGHT, INPUT_WIDTH
@@ -82,3 +83,14 @@ def test_views_keep_image_and_mask_together():
     assert images.shape == (8, 3, 128, 160)
     assert ((images[:, :1] >= 0.5).float() == masks).all()
     assert 0.1 < masks.mean() < 0.9
+
+
+def test_negatives_fill_the_input(tmp_path):
+    Image.new("RGB", (90, 30), (10, 200, 30)).save(tmp_path / "wide.png")
+    Image.new("L", (30, 90), 7).save(tmp_path / "tall.jpg")
+    for _ in range(2):
+        photographs = data.read_negatives([tmp_path], tmp_path / "cache")
+        assert photographs.shape == (2, 3, INPUT_HEIGHT, INPUT_WIDTH)
+        assert photographs[1, :, 100, 100].tolist() == [10, 200, 30]
+    with pytest.raises(data.RecordingError, match="no photographs"):
+        data.read_negatives([tmp_path / "cache"], tmp_path / "cache")

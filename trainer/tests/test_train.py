@@ -8,7 +8,8 @@ from safetensors.torch import load_file
 from whereabot_trainer import data, evaluate, golden
 from whereabot_trainer.__main__ import main
 from whereabot_trainer.export import choose_presence, read_model
-from whereabot_trainer.networks import JOINT_INPUT, Network, paper_joint_layers
+from whereabot_trainer.networks import (
+    JOINT_INPUT, MASK_INPUT, Network, context_mask_layers, paper_joint_layers, paper_mask_layers)
 from whereabot_trainer.train import Standardised, load_network
 
 
@@ -109,7 +110,7 @@ def test_committed_golden_files_are_what_pytorch_computes(tmp_path, request):
     committed = request.config.rootpath.parent / "tests" / "data" / "golden"
     golden.write_golden(tmp_path)
     names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == sorted(path.name for path in committed.iterdir()) and len(names) == 6
+    assert names == sorted(path.name for path in committed.iterdir()) and len(names) == 8
     for name in names:
         made, kept = load_file(tmp_path / name), load_file(committed / name)
         assert made.keys() == kept.keys()
@@ -120,6 +121,22 @@ def test_committed_golden_files_are_what_pytorch_computes(tmp_path, request):
     values = golden.cascade_activations(
         mask, joint, description["overlay"], load_file(committed / "tiny.activations.safetensors")["mask.image"])
     assert (values["joints"] - load_file(committed / "tiny.activations.safetensors")["joints"]).abs().max() > 1e-5
+
+
+@pytest.mark.parametrize("layers", [paper_mask_layers(), context_mask_layers()])
+def test_folding_normalisation_keeps_the_function(layers):
+    torch.manual_seed(0)
+    network, plain = Network(layers, MASK_INPUT, normalise=True), Network(layers, MASK_INPUT)
+    for _ in range(3):
+        network(torch.rand(4, 3, 212, 256))
+    network.eval()
+    images = torch.rand(2, 3, 212, 256)
+    before = network(images)
+    network.conv1_norm.weight.data *= 1.01
+    changed = network(images)
+    network.fold_normalisation()
+    assert torch.allclose(network(images), changed, atol=1e-5) and not torch.allclose(before, changed, atol=1e-5)
+    assert network.state_dict().keys() == plain.state_dict().keys()
 
 
 def test_a_network_refuses_what_it_cannot_build():

@@ -17,7 +17,7 @@ def _training_flags(parser, *, minutes, batch, learning_rate, momentum, dilation
     parser.add_argument("--resume", action="store_true", help="go on from RUN/last.pt")
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--minutes", type=float, default=minutes, metavar="M",
-                        help="train for so long, resumed parts included; learning rate and momentum follow the clock (%(default)s)")
+                        help="train for so long, resumed parts included; rates follow the clock (%(default)s)")
     length.add_argument("--iterations", type=int, metavar="N", help="train for N batches instead: reproducible")
     parser.add_argument("--batch", type=int, default=batch, metavar="N", help="samples a batch (%(default)s)")
     parser.add_argument("--dilations", type=_integers, default=dilations, metavar="D,D,...",
@@ -29,6 +29,8 @@ def _training_flags(parser, *, minutes, batch, learning_rate, momentum, dilation
                         help="momentum of SGD or beta1 of AdamW, growing linearly (%(default)s)")
     parser.add_argument("--weight-decay", type=float, default=1e-4, metavar="W", help="(%(default)s)")
     parser.add_argument("--clip-gradient", type=float, default=5.0, metavar="NORM", help="(%(default)s)")
+    parser.add_argument("--normalise", action=argparse.BooleanOptionalAction, default=True,
+                        help="batch normalisation while training, folded into the convolutions at export (%(default)s)")
     parser.add_argument("--evaluate-every", type=int, default=500, metavar="N",
                         help="validate and save every N batches (%(default)s)")
     parser.add_argument("--precision", choices=("bf16", "f32"), default="bf16", help="of the training pass (%(default)s)")
@@ -65,20 +67,28 @@ def main(argv=None):
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     command = commands.add_parser("train-mask", help="train the mask network")
-    _training_flags(command, minutes=40, batch=16, learning_rate=(3e-3, 3e-5), momentum=(0.9, 0.9),
+    _training_flags(command, minutes=40, batch=8, learning_rate=(4e-3, 2e-5), momentum=(0.9, 0.9),
                     dilations=(1, 2, 4, 8, 1))
+    command.add_argument("--family", choices=("paper", "context"), default="paper",
+                         help="the paper's network, or a wider one with skips that has no --dilations (%(default)s)")
     command.add_argument("--crop", nargs=2, type=int, default=(160, 128), metavar=("W", "H"),
                          help="pixels of a training crop (%(default)s)")
-    command.add_argument("--zoom", nargs=2, type=float, default=(0.7, 2.0), metavar=("LEAST", "MOST"),
+    command.add_argument("--zoom", nargs=2, type=float, default=(0.7, 1.6), metavar=("LEAST", "MOST"),
                          help="magnification of the crops (%(default)s)")
+    command.add_argument("--negatives", nargs="+", metavar="DIR",
+                         help="folders of photographs without a robot, to train on beside the recordings")
+    command.add_argument("--negative-share", type=float, default=0.15, metavar="SHARE",
+                         help="share of training samples that are such photographs (%(default)s)")
     command.set_defaults(run=_run(train.train_mask))
 
     command = commands.add_parser("train-joint", help="train the joint network")
-    _training_flags(command, minutes=35, batch=16, learning_rate=(1e-3, 1e-5), momentum=(0.9, 0.95), dilations=(1, 1, 1))
-    command.add_argument("--pool", type=int, default=2, metavar="P", help="size of both max-pools (%(default)s)")
+    _training_flags(command, minutes=35, batch=16, learning_rate=(2e-3, 2e-5), momentum=(0.9, 0.95), dilations=(1, 2, 4))
+    command.add_argument("--pool", type=int, default=4, metavar="P", help="size of both max-pools (%(default)s)")
+    command.add_argument("--overlay", choices=("threshold", "multiply"), default="threshold",
+                         help="colour where the mask is at least 0.5, or colour times mask (%(default)s)")
     command.add_argument("--mask-run", metavar="RUN", help="finished run of train-mask, to validate the full system")
     command.add_argument("--estimated-masks", type=float, default=0.0, metavar="SHARE",
-                         help="share of training samples that see the mask run's masks instead of the true ones (%(default)s)")
+                         help="share of training samples with the mask run's masks for the true ones (%(default)s)")
     command.add_argument("--estimated-after", type=float, default=0.0, metavar="PROGRESS",
                          help="from this progress (0 to 1) on (%(default)s)")
     command.add_argument("--min-coverage", type=float, default=0.005, metavar="SHARE",
@@ -91,7 +101,7 @@ def main(argv=None):
     command.add_argument("--validation", nargs="+", required=True, metavar="DIR",
                          help="recordings to choose the presence threshold and measure the figures on")
     command.add_argument("--validation-samples", type=int, default=100, metavar="N",
-                         help="choose on the first N in random order, as training did, and report on the rest (%(default)s)")
+                         help="choose on N, the ones training validated on, and report on the rest (%(default)s)")
     command.add_argument("--photos", metavar="DIR", help="annotated photos, to report the mask's IoU on")
     command.add_argument("--annotations", metavar="FILE", help="annotations of --photos")
     command.add_argument("--photos-without", nargs="*", default=[], metavar="DIR",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, ImageOps
 from tqdm import tqdm
 
 from .networks import CAMERA, INPUT_HEIGHT, INPUT_WIDTH, JOINTS
@@ -87,7 +87,8 @@ def _decode(folder, number, sample):
             mask = np.asarray(file.convert("L"))
         for key, shape in (("image", image.shape[:2]), ("mask", mask.shape)):
             if shape != (2 * INPUT_HEIGHT, 2 * INPUT_WIDTH):
-                raise ValueError(f"{key}: expected {2 * INPUT_WIDTH}x{2 * INPUT_HEIGHT} pixels, found {shape[1]}x{shape[0]}")
+                raise ValueError(
+                    f"{key}: expected {2 * INPUT_WIDTH}x{2 * INPUT_HEIGHT} pixels, found {shape[1]}x{shape[0]}")
     except (OSError, ValueError) as error:
         raise RecordingError(f"{folder / 'samples.jsonl'}: line {number}: {error}") from error
     return halve(image), (halve(mask) >= 128).astype(np.uint8)
@@ -165,6 +166,24 @@ class Samples:
         return torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255, torch.from_numpy(masks)[:, None].float()
 
 
+def read_negatives(folders, cache):
+    """Photographs without a robot as uint8 [N, 3, 212, 256], cut to fill the networks' input; decoded once."""
+    paths = sorted(path for folder in folders for path in Path(folder).resolve().iterdir()
+                   if path.suffix.lower() in {".jpg", ".jpeg", ".png", ".webp"})
+    if not paths:
+        raise RecordingError(f"no photographs in {', '.join(map(str, folders))}")
+    names = "\n".join(map(str, paths))
+    stored = Path(cache) / f"negatives-{hashlib.sha256(names.encode()).hexdigest()[:8]}.npy"
+    if not stored.exists():
+        stored.parent.mkdir(parents=True, exist_ok=True)
+        pictures = []
+        for path in tqdm(paths, "decoding photographs", mininterval=5):
+            with Image.open(path) as file:
+                pictures.append(np.asarray(ImageOps.fit(file.convert("RGB"), (INPUT_WIDTH, INPUT_HEIGHT))))
+        np.save(stored, np.stack(pictures).transpose(0, 3, 1, 2))
+    return torch.from_numpy(np.load(stored))
+
+
 def split(samples, seed, validation_share=0.2):
     """(training, validation) numbers, at random by seed.
 
@@ -182,39 +201,50 @@ def _uniform(count, low, high, *shape):
 
 def jitter_colours(images):
     """Other light and another camera: gain, white balance, contrast, saturation, gamma, blur and noise."""
+    # A few images at a time stay in a CPU's cache through all of these passes.
+    return torch.cat([_jitter_colours(part) for part in images.split(4)])
+
+
+def _jitter_colours(images):
     count = len(images)
-    gain = _uniform(count, 0.6, 1.4, 1, 1, 1) * _uniform(count, 0.88, 1.12, 3, 1, 1)
-    images = images * gain
+    images = images * (_uniform(count, 0.75, 1.25, 1, 1, 1) * _uniform(count, 0.93, 1.07, 3, 1, 1))
     grey = images.mean(1, keepdim=True)
-    images = grey + (images - grey) * _uniform(count, 0.4, 1.5, 1, 1, 1)
+    images = torch.lerp(grey, images, _uniform(count, 0.6, 1.4, 1, 1, 1))
     level = grey.mean((2, 3), keepdim=True)
-    images = level + (images - level) * _uniform(count, 0.7, 1.3, 1, 1, 1)
-    images = images.clamp(1e-3, 1) ** torch.exp(_uniform(count, -0.4, 0.4, 1, 1, 1))
-    soft = torch.nn.functional.avg_pool2d(images, 3, 1, 1, count_include_pad=False)
-    # Between sharpened (-0.5) and blurred (1).
-    images = torch.lerp(images, soft, _uniform(count, -0.5, 1, 1, 1, 1))
-    images = images + torch.randn_like(images) * _uniform(count, 0, 0.04, 1, 1, 1)
+    images = torch.lerp(level, images, _uniform(count, 0.8, 1.2, 1, 1, 1)).clamp_(1e-3, 1)
+    images = images.pow_(torch.exp(_uniform(count, -0.25, 0.25, 1, 1, 1)))
+    if torch.rand(()) < 0.25:
+        soft = torch.nn.functional.avg_pool2d(images, 3, 1, 1, count_include_pad=False)
+        # Between sharpened (-0.5) and blurred (1).
+        images = torch.lerp(images, soft, _uniform(count, -0.5, 1, 1, 1, 1))
+    if torch.rand(()) < 0.5:
+        images = images + torch.empty_like(images).uniform_(-1, 1) * _uniform(count, 0, 0.08, 1, 1, 1)
     return images.clamp(0, 1)
 
 
-def random_views(images, masks, height, width, tilt_degrees=10, zoom=(0.7, 2.0)):
-    """Random crops of height x width: zoomed, tilted, and mirrored half of the time. For the mask network alone: an arm
-    is not its mirror image, and a zoom changes the camera."""
+def random_views(images, masks, height, width, tilt_degrees=10, zoom=(0.7, 1.6)):
+    """Random views of height x width: zoomed, tilted, and mirrored half of the time. For the mask network alone: an arm
+    is not its mirror image, and a zoom changes the camera. Beyond the image it is reflected, or at times black, as
+    beside a portrait photo."""
     count, _, full_height, full_width = images.shape
     step = 1 / torch.exp(_uniform(count, math.log(zoom[0]), math.log(zoom[1])))
     angle = torch.deg2rad(_uniform(count, -tilt_degrees, tilt_degrees))
     mirror = torch.where(torch.rand(count) < 0.5, -1.0, 1.0)
-    room_x = (full_width - width * step).clamp(min=0) / full_width
-    room_y = (full_height - height * step).clamp(min=0) / full_height
     cos, sin = torch.cos(angle) * step, torch.sin(angle) * step
+    shift_x = (full_width - width * step).abs() / full_width * _uniform(count, -1, 1)
+    shift_y = (full_height - height * step).abs() / full_height * _uniform(count, -1, 1)
     # grid_sample's coordinates run from -1 to 1 over the source's width and height.
     theta = torch.stack([
-        torch.stack([mirror * cos * width / full_width, -sin * height / full_width, room_x * _uniform(count, -1, 1)], 1),
-        torch.stack([mirror * sin * width / full_height, cos * height / full_height, room_y * _uniform(count, -1, 1)], 1),
+        torch.stack([mirror * cos * width / full_width, -sin * height / full_width, shift_x], 1),
+        torch.stack([mirror * sin * width / full_height, cos * height / full_height, shift_y], 1),
     ], 1)
     grid = torch.nn.functional.affine_grid(theta, [count, 1, height, width], align_corners=False)
-    both = torch.nn.functional.grid_sample(
-        torch.cat([images, masks], 1), grid, padding_mode="border", align_corners=False)
+    both = torch.cat([images, masks], 1)
+    # Sampled further apart than this, single pixels would alias.
+    shrunk = step > 1.5
+    both[shrunk] = torch.nn.functional.avg_pool2d(both[shrunk], 3, 1, 1, count_include_pad=False)
+    padding = "zeros" if torch.rand(()) < 0.1 else "reflection"
+    both = torch.nn.functional.grid_sample(both, grid, padding_mode=padding, align_corners=False)
     return both[:, :3], (both[:, 3:] >= 0.5).float()
 
 
@@ -236,7 +266,7 @@ def rotate_camera(images, joints, rotations, camera=CAMERA):
     count, _, height, width = images.shape
     k = torch.tensor([[camera["fx"], 0, camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1]])
     back = k @ rotations.mT @ torch.linalg.inv(k)
-    v, u = torch.meshgrid(torch.arange(height, dtype=torch.float32), torch.arange(width, dtype=torch.float32), indexing="ij")
+    v, u = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
     source = torch.stack([u, v, torch.ones_like(u)], -1).reshape(-1, 3) @ back.mT
     source = source[..., :2] / source[..., 2:]
     # Pixel centres are whole numbers here; grid_sample's -1 and 1 are the image's outer edges.

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from . import losses
-from .networks import JOINTS
+from .networks import JOINTS, overlay
 
 BATCH = 8
 # Bins of the mask's logit, for IoU at every threshold at once.
@@ -62,7 +62,7 @@ def figures_by_threshold(robot, background):
     hits, alarms = (part[:, ::-1].cumsum(1)[:, ::-1].astype(float) for part in (robot, background))
     positives = hits[:, :1]
     shown = positives[:, 0] > 0
-    iou = (hits / (positives + alarms))[shown].mean(0) if shown.any() else np.zeros(robot.shape[1])
+    iou = (hits[shown] / (positives + alarms)[shown]).mean(0) if shown.any() else np.zeros(robot.shape[1])
     total = robot.sum() + background.sum()
     return {
         "accuracy": (hits.sum(0) + background.sum() - alarms.sum(0)) / total, "iou": iou,
@@ -83,22 +83,22 @@ def score_mask(network, samples, numbers, device):
 
 
 @torch.no_grad()
-def joint_errors(network, metres, samples, numbers, estimated, device):
-    """Distances [N, 6] in metres with the true masks, or with `estimated` ones."""
+def joint_errors(network, metres, samples, numbers, estimated, rule, device):
+    """Distances [N, 6] in metres with the true masks, or with `estimated` ones, overlaid by the rule."""
     errors = []
     for batch in _batches(numbers):
         images, masks = samples.pixels(batch)
         if estimated is not None:
             masks = torch.stack([torch.from_numpy(estimated[int(number)])[None].float() / 255 for number in batch])
-        outputs = network((images * masks).to(device).contiguous(memory_format=torch.channels_last))
+        outputs = network(overlay(images, masks, rule).to(device).contiguous(memory_format=torch.channels_last))
         truth = torch.from_numpy(samples.joints[batch])
         errors.append(losses.joint_distances(metres(outputs).cpu(), truth).numpy())
     return np.concatenate(errors)
 
 
-def score_joints(network, metres, samples, numbers, estimated, device, name):
+def score_joints(network, metres, samples, numbers, estimated, rule, device, name):
     """Mean and median over samples of the error in centimetres, each sample's being the mean over its joints."""
-    each = 100 * joint_errors(network, metres, samples, numbers, estimated, device).mean(1)
+    each = 100 * joint_errors(network, metres, samples, numbers, estimated, rule, device).mean(1)
     return {f"{name}_mean_cm": round(float(each.mean()), 2), f"{name}_median_cm": round(float(np.median(each)), 2)}
 
 

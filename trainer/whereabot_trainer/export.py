@@ -15,11 +15,11 @@ from .train import Standardised, load_network
 DTYPES = {"f32": torch.float32, "f16": torch.float16}
 
 
-def describe(mask_layers, joint_layers, *, robot, overlay, presence, card,
+def describe(mask_layers, joint_layers, *, family, robot, overlay, presence, card,
              width=INPUT_WIDTH, height=INPUT_HEIGHT, camera=CAMERA):
     """The description that the engine reads from the model file."""
     return {
-        "version": 1, "family": "paper", "robot": robot, "joints": JOINTS,
+        "version": 1, "family": family, "robot": robot, "joints": JOINTS,
         "input": {"width": width, "height": height}, "camera": camera,
         "mask_network": {"layers": mask_layers}, "overlay": overlay,
         "joint_network": {"layers": joint_layers}, "presence": presence, "card": card,
@@ -79,6 +79,8 @@ def export_runs(args):
     Standardised(joint_state["card"]["mean"], joint_state["card"]["deviation"]).fold(
         getattr(joint, joint.layers[-1]["name"]))
 
+    rule = joint_state["card"]["overlay"]
+
     samples = data.Samples(args.validation, args.cache)
     # The first part chose the checkpoints and chooses the presence threshold; the rest is what the figures are about.
     order = np.random.default_rng(args.seed).permutation(len(samples))
@@ -100,12 +102,14 @@ def export_runs(args):
         [coverage[n] for n in chosen if seen[n]], without + list(photos_without.values()))
 
     robots = reported[seen[reported]]
-    figures = evaluate.score_mask(mask, samples, reported, args.device)
+    measured = evaluate.score_mask(mask, samples, reported, args.device)
+    figures = {name: measured[name] for name in ("accuracy", "iou", "precision", "recall")}
     for name, masks in (("true_mask", None), ("estimated_mask", estimated)):
-        figures |= evaluate.score_joints(joint, evaluate.identity_metres, samples, robots, masks, args.device, name)
+        figures |= evaluate.score_joints(
+            joint, evaluate.identity_metres, samples, robots, masks, rule, args.device, name)
     found = robots[[coverage[n] >= least for n in robots]]
     figures |= {"found_" + key: value for key, value in evaluate.score_joints(
-        joint, evaluate.identity_metres, samples, found, estimated, args.device, "estimated_mask").items()}
+        joint, evaluate.identity_metres, samples, found, estimated, rule, args.device, "estimated_mask").items()}
     nothing = [coverage[n] for n in reported if empty[n]]
     figures["presence"] = {
         "robots_found": _rate([coverage[n] >= least for n in robots]),
@@ -129,10 +133,10 @@ def export_runs(args):
         "licence": args.licence,
     }
     description = describe(
-        mask.layers, joint.layers, robot=args.robot, overlay={"rule": "multiply"},
+        mask.layers, joint.layers, family=mask_state["card"]["family"], robot=args.robot, overlay=rule,
         presence={"mask_threshold": 0.5, "min_coverage": least}, card=card)
     write_model(args.out, mask, joint, description, args.dtype)
-    print(json.dumps({"presence": description["presence"], **figures}, indent=1))
+    print(json.dumps({"chosen": description["presence"], "figures": figures}, indent=1))
     print(f"{args.out}: {os.path.getsize(args.out) / 1e6:.2f} MB")
 
 
@@ -141,8 +145,9 @@ def _rate(hits):
 
 
 def _training(state):
-    keep = ("protocol", "seed", "precision", "optimizer", "learning_rate", "momentum", "batch", "samples", "crop", "zoom",
-            "foreground_share", "w_fg", "w_bg", "estimated_masks", "estimated_after")
+    keep = ("family", "protocol", "seed", "precision", "optimizer", "learning_rate", "momentum", "batch", "normalise",
+            "samples", "crop", "zoom", "negatives", "negative_share", "foreground_share", "w_fg", "w_bg",
+            "estimated_masks", "estimated_after")
     return {key: state["card"][key] for key in keep if key in state["card"]} | {
         "minutes": round(state["seconds"] / 60, 1), "iterations": state["iteration"],
         "samples_available": sum(source["samples"] for source in state["card"]["training_recordings"])}

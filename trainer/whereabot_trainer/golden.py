@@ -14,6 +14,7 @@ from .export import describe, read_model, write_model
 from .networks import JOINT_INPUT, JOINTS, MASK_INPUT, Network, overlay
 
 WIDTH, HEIGHT = 20, 14
+CONTEXT_WIDTH, CONTEXT_HEIGHT = 24, 12
 # Odd channel counts, a dilation beyond the image's height, and kernels of 1 and 5 find layout and padding errors.
 MASK_LAYERS = [
     {"name": "conv1", "op": "conv2d", "inputs": ["image"], "out_channels": 5, "kernel": 3, "dilation": 1,
@@ -38,25 +39,46 @@ JOINT_LAYERS = [
      "activation": "relu"},
     {"name": "dense", "op": "dense", "inputs": ["conv3"], "out_features": 3 * len(JOINTS), "activation": "none"},
 ]
+# Skips: what is pooled by 2 and by 3 is enlarged by as much and meets what was there before.
+CONTEXT_LAYERS = [
+    {"name": "conv1", "op": "conv2d", "inputs": ["image"], "out_channels": 5, "kernel": 3, "dilation": 1,
+     "activation": "relu"},
+    {"name": "pool1", "op": "max_pool2d", "inputs": ["conv1"], "size": 2},
+    {"name": "conv2", "op": "conv2d", "inputs": ["pool1"], "out_channels": 7, "kernel": 3, "dilation": 2,
+     "activation": "relu"},
+    {"name": "pool2", "op": "max_pool2d", "inputs": ["conv2"], "size": 3},
+    {"name": "conv3", "op": "conv2d", "inputs": ["pool2"], "out_channels": 6, "kernel": 3, "dilation": 1,
+     "activation": "relu"},
+    {"name": "up1", "op": "upsample2d", "inputs": ["conv3"], "scale": 3},
+    {"name": "skip1", "op": "concat", "inputs": ["up1", "conv2"]},
+    {"name": "conv4", "op": "conv2d", "inputs": ["skip1"], "out_channels": 3, "kernel": 1, "dilation": 1,
+     "activation": "none"},
+    {"name": "up2", "op": "upsample2d", "inputs": ["conv4"], "scale": 2},
+    {"name": "skip2", "op": "concat", "inputs": ["up2", "conv1", "image"]},
+    {"name": "logit", "op": "conv2d", "inputs": ["skip2"], "out_channels": 1, "kernel": 3, "dilation": 1,
+     "activation": "none"},
+    {"name": "mask", "op": "sigmoid", "inputs": ["logit"]},
+]
 CARD = {"data": "none: random weights", "purpose": "golden files of whereabot's tests"}
 
 
-def _networks(seed, image):
+def _networks(seed, image, mask_layers):
     torch.manual_seed(seed)
-    shape = (3, HEIGHT, WIDTH)
-    mask = Network(MASK_LAYERS, MASK_INPUT, shape)
+    shape = tuple(image.shape)
+    mask = Network(mask_layers, MASK_INPUT, shape)
     joint = Network(JOINT_LAYERS, JOINT_INPUT, shape)
     # Default weights give a mask that is nearly the same all over, and a dead first layer behind it: spread the values
     # and centre the mask on 0.5, so that a wrong layer shows.
     with torch.no_grad():
         mask.conv1.weight *= 3
         mask.conv3.weight *= 3
-        mask.conv4.weight *= 8
-        logits = mask.activations(image[None])["conv4"].flatten().sort().values
+        last = getattr(mask, mask_layers[-1]["inputs"][0])
+        last.weight *= 8
+        logits = mask.activations(image[None])[mask_layers[-1]["inputs"][0]].flatten().sort().values
         middle = logits[len(logits) // 4 : 3 * len(logits) // 4]
         # No pixel may lie near the threshold, where rounding could flip it: put 0.5 in the middle's widest gap.
         gap = middle.diff().argmax()
-        mask.conv4.bias -= (middle[gap] + middle[gap + 1]) / 2
+        last.bias -= (middle[gap] + middle[gap + 1]) / 2
         joint.conv1.weight *= 3
         joint.conv1.bias += 0.2
         joint.conv2.weight *= 3
@@ -76,18 +98,22 @@ def cascade_activations(mask, joint, rule, image):
 
 
 def write_golden(folder, seed=1):
-    """Writes the models `tiny`, `threshold` and `tiny_f16` with their activations."""
+    """Writes the models `tiny`, `threshold`, `tiny_f16` and `context` with their activations."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     torch.use_deterministic_algorithms(True)
     torch.set_num_threads(1)
-    image = torch.rand((3, HEIGHT, WIDTH), generator=torch.Generator().manual_seed(seed))
-    mask, joint = _networks(seed, image)
-    camera = {"fx": 14.25, "fy": 14.25, "cx": (WIDTH - 1) / 2, "cy": (HEIGHT - 1) / 2}
     multiply, threshold = {"rule": "multiply"}, {"rule": "threshold", "threshold": 0.5}
-    for name, rule, dtype in (("tiny", multiply, "f32"), ("threshold", threshold, "f32"), ("tiny_f16", multiply, "f16")):
+    paper, context = (MASK_LAYERS, WIDTH, HEIGHT), (CONTEXT_LAYERS, CONTEXT_WIDTH, CONTEXT_HEIGHT)
+    for name, family, (layers, width, height), rule, dtype in (
+        ("tiny", "paper", paper, multiply, "f32"), ("threshold", "paper", paper, threshold, "f32"),
+        ("tiny_f16", "paper", paper, multiply, "f16"), ("context", "context", context, multiply, "f32"),
+    ):
+        image = torch.rand((3, height, width), generator=torch.Generator().manual_seed(seed))
+        mask, joint = _networks(seed, image, layers)
         description = describe(
-            MASK_LAYERS, JOINT_LAYERS, robot="golden", overlay=rule, camera=camera, width=WIDTH, height=HEIGHT,
+            layers, JOINT_LAYERS, family=family, robot="golden", overlay=rule, width=width, height=height,
+            camera={"fx": 14.25, "fy": 14.25, "cx": (width - 1) / 2, "cy": (height - 1) / 2},
             presence={"mask_threshold": 0.5, "min_coverage": 0.01}, card=CARD)
         path = folder / f"{name}.safetensors"
         write_model(path, mask, joint, description, dtype)

@@ -31,8 +31,39 @@ def paper_mask_layers(dilations=(1, 2, 4, 8, 1)):
     return layers
 
 
+def context_mask_layers():
+    """The context mask network: a wide view at a quarter of the resolution, upsampled, with two skips.
+
+    With a free camera the paper's mask network runs out of capacity: this one sees the whole image, for two thirds of
+    the arithmetic.
+    """
+    def conv(name, source, channels, kernel=3, dilation=1, activation="relu"):
+        return {"name": name, "op": "conv2d", "inputs": [source], "out_channels": channels, "kernel": kernel,
+                "dilation": dilation, "activation": activation}
+
+    layers = [
+        conv("conv1", MASK_INPUT, 16),
+        {"name": "pool1", "op": "max_pool2d", "inputs": ["conv1"], "size": 2},
+        conv("conv2", "pool1", 32),
+        {"name": "pool2", "op": "max_pool2d", "inputs": ["conv2"], "size": 2},
+    ]
+    source = "pool2"
+    for number, dilation in enumerate((1, 2, 4, 8, 16, 1), start=3):
+        layers.append(conv(f"conv{number}", source, 64, dilation=dilation))
+        source = f"conv{number}"
+    return layers + [
+        conv("conv9", source, 32, kernel=1),
+        {"name": "up1", "op": "upsample2d", "inputs": ["conv9"], "scale": 2},
+        {"name": "skip1", "op": "concat", "inputs": ["up1", "conv2"]},
+        conv("conv10", "skip1", 32),
+        {"name": "up2", "op": "upsample2d", "inputs": ["conv10"], "scale": 2},
+        {"name": "skip2", "op": "concat", "inputs": ["up2", "conv1"]},
+        conv("conv11", "skip2", 1, activation="sigmoid"),
+    ]
+
+
 def paper_joint_layers(dilations=(1, 1, 1), pool=2, outputs=18):
-    """The paper's joint network: convolutions of 32, 64 and 128 filters, max-pooling between them, and a dense layer."""
+    """The paper's joint network: convolutions of 32, 64 and 128 filters, max-pooling between, and a dense layer."""
     layers, source = [], JOINT_INPUT
     for number, (filters, dilation) in enumerate(zip((32, 64, 128), dilations, strict=True), start=1):
         layers.append({
@@ -52,11 +83,13 @@ def paper_joint_layers(dilations=(1, 1, 1), pool=2, outputs=18):
 class Network(nn.Module):
     """A layer list as a PyTorch module; its state_dict keys are `{layer}.weight` and `{layer}.bias`.
 
-    `shape` is the input's (channels, height, width). Tensors are NCHW.
+    `shape` is the input's (channels, height, width). Tensors are NCHW. With `normalise`, batch normalisation stands
+    between each convolution and its ReLU; it trains far sooner, and `fold_normalisation` takes it away again.
     """
 
-    def __init__(self, layers, input_name, shape=(3, INPUT_HEIGHT, INPUT_WIDTH)):
+    def __init__(self, layers, input_name, shape=(3, INPUT_HEIGHT, INPUT_WIDTH), normalise=False):
         super().__init__()
+        self.normalise = normalise
         self.layers = layers
         self.input_name = input_name
         shapes = {input_name: tuple(shape)}
@@ -64,22 +97,31 @@ class Network(nn.Module):
             name, op = layer["name"], layer["op"]
             if name in shapes or hasattr(self, name):
                 raise ValueError(f"layer name {name!r} is taken")
-            (source,) = layer["inputs"]
-            if source not in shapes:
-                raise ValueError(f"layer {name!r} reads {source!r}, which no earlier layer makes")
-            channels, *size = shapes[source]
+            for source in layer["inputs"]:
+                if source not in shapes:
+                    raise ValueError(f"layer {name!r} reads {source!r}, which no earlier layer makes")
+            sources = [shapes[source] for source in layer["inputs"]]
+            if len({tuple(shape[1:]) for shape in sources}) != 1 or (len(sources) > 1) != (op == "concat"):
+                raise ValueError(f"layer {name!r}: {op} cannot read inputs of shapes {sources}")
+            channels, *size = sources[0]
             if op == "conv2d":
                 kernel, dilation = layer["kernel"], layer["dilation"]
                 self.add_module(name, nn.Conv2d(
                     channels, layer["out_channels"], kernel, dilation=dilation, padding=dilation * (kernel - 1) // 2))
+                if normalise and layer["activation"] == "relu":
+                    self.add_module(f"{name}_norm", nn.BatchNorm2d(layer["out_channels"]))
                 shapes[name] = (layer["out_channels"], *size)
             elif op == "max_pool2d":
                 shapes[name] = (channels, *(extent // layer["size"] for extent in size))
             elif op == "dense":
-                self.add_module(name, nn.Linear(math.prod(shapes[source]), layer["out_features"]))
+                self.add_module(name, nn.Linear(math.prod(sources[0]), layer["out_features"]))
                 shapes[name] = (layer["out_features"],)
             elif op == "sigmoid":
-                shapes[name] = shapes[source]
+                shapes[name] = sources[0]
+            elif op == "upsample2d":
+                shapes[name] = (channels, *(extent * layer["scale"] for extent in size))
+            elif op == "concat":
+                shapes[name] = (sum(shape[0] for shape in sources), *size)
             else:
                 raise ValueError(f"layer {name!r} has the unknown op {op!r}")
         self.shapes = shapes
@@ -92,6 +134,8 @@ class Network(nn.Module):
             value = values[layer["inputs"][0]]
             if op == "conv2d":
                 value = getattr(self, name)(value)
+                if self.normalise and layer["activation"] == "relu":
+                    value = getattr(self, f"{name}_norm")(value)
             elif op == "max_pool2d":
                 value = nn.functional.max_pool2d(value, layer["size"])
             elif op == "dense":
@@ -100,6 +144,11 @@ class Network(nn.Module):
                     value = getattr(self, name)(value.float().flatten(1))
             elif op == "sigmoid":
                 value = torch.sigmoid(value.float())
+            elif op == "upsample2d":
+                value = nn.functional.interpolate(
+                    value, scale_factor=layer["scale"], mode="bilinear", align_corners=False)
+            elif op == "concat":
+                value = torch.cat([values[source] for source in layer["inputs"]], 1)
             activation = layer.get("activation", "none")
             if activation == "relu":
                 value = torch.relu(value)
@@ -113,6 +162,19 @@ class Network(nn.Module):
 
     def forward(self, x):
         return self.activations(x)[self.layers[-1]["name"]]
+
+    @torch.no_grad()
+    def fold_normalisation(self):
+        """Multiplies each batch normalisation, as it is in eval mode, into its convolution."""
+        for layer in self.layers if self.normalise else []:
+            norm = self._modules.pop(f"{layer['name']}_norm", None)
+            if norm is not None:
+                convolution = getattr(self, layer["name"])
+                scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
+                convolution.weight *= scale[:, None, None, None]
+                convolution.bias.copy_((convolution.bias - norm.running_mean) * scale + norm.bias)
+        self.normalise = False
+        return self
 
 
 def overlay(image, mask, rule):

@@ -30,7 +30,7 @@ def read_photo(path):
     """(image [3, H, W] in [0, 1], share of the input that the photo fills)."""
     with Image.open(path) as file:
         pixels, share = _fit(file.convert("RGB"), Image.Resampling.LANCZOS)
-    return torch.from_numpy(pixels).permute(2, 0, 1).float() / 255, share
+    return torch.from_numpy(pixels.copy()).permute(2, 0, 1).float() / 255, share
 
 
 def _draw(annotation, fills):

@@ -11,7 +11,8 @@ import torch
 from tqdm import tqdm
 
 from . import data, evaluate, losses
-from .networks import JOINT_INPUT, JOINTS, MASK_INPUT, Network, paper_joint_layers, paper_mask_layers
+from .networks import (
+    JOINT_INPUT, JOINTS, MASK_INPUT, Network, context_mask_layers, overlay, paper_joint_layers, paper_mask_layers)
 
 
 # --- the loop --------------------------------------------------------------------------------------------------------
@@ -88,8 +89,8 @@ def fit(args, network, numbers, batch_loss, score, better, card):
 
     def save(path, **more):
         partial = path.with_suffix(".partial")
-        torch.save({"layers": network.layers, "network": network.state_dict(), "card": card,
-                    "iteration": iteration, "seconds": seconds, **more}, partial)
+        torch.save({"layers": network.layers, "normalise": network.normalise, "network": network.state_dict(),
+                    "card": card, "iteration": iteration, "seconds": seconds, **more}, partial)
         partial.replace(path)
 
     started, seconds, total, counted = time.monotonic(), before, 0.0, 0
@@ -153,17 +154,27 @@ def load_samples(args):
         "training_recordings": samples.sources, "validation_recordings": held_out.sources if args.validation else [],
         "protocol": protocol, "seed": args.seed, "precision": args.precision, "optimizer": args.optimizer,
         "learning_rate": args.learning_rate, "momentum": args.momentum, "batch": args.batch,
-        "minutes": args.minutes, "iterations": args.iterations,
+        "minutes": args.minutes, "iterations": args.iterations, "normalise": args.normalise,
     }
     return samples, numbers, held_out, np.sort(validation), card
 
 
+def initialise(network):
+    """He initialisation: with PyTorch's own, a chain of ReLU layers without normalisation starts nearly silent."""
+    for layer in network.layers:
+        if layer.get("activation") == "relu":
+            module = getattr(network, layer["name"])
+            torch.nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+            torch.nn.init.zeros_(module.bias)
+    return network
+
+
 def load_network(run, name="best.pt"):
-    """(network in eval mode, checkpoint) of a run; the network's input is told from its first layer."""
+    """(network in eval mode, without normalisation, checkpoint) of a run; its first layer tells the input's name."""
     state = torch.load(Path(run) / name, weights_only=False, map_location="cpu")
-    network = Network(state["layers"], state["layers"][0]["inputs"][0])
+    network = Network(state["layers"], state["layers"][0]["inputs"][0], normalise=state["normalise"])
     network.load_state_dict(state["network"])
-    return network.eval(), state
+    return network.eval().fold_normalisation(), state
 
 
 # --- the mask network ------------------------------------------------------------------------------------------------
@@ -173,11 +184,23 @@ def train_mask(args):
     share = float(samples.coverage[numbers].mean())
     w_fg, w_bg = losses.class_weights(share)
     height, width = args.crop[1], args.crop[0]
-    card |= {"foreground_share": share, "w_fg": w_fg, "w_bg": w_bg, "crop": args.crop, "zoom": args.zoom}
-    network = Network(paper_mask_layers(args.dilations), MASK_INPUT).to(args.device, memory_format=torch.channels_last)
+    card |= {"family": args.family, "foreground_share": share, "w_fg": w_fg, "w_bg": w_bg,
+             "crop": args.crop, "zoom": args.zoom}
+    layers = context_mask_layers() if args.family == "context" else paper_mask_layers(args.dilations)
+    network = initialise(Network(layers, MASK_INPUT, normalise=args.normalise))
+    network = network.to(args.device, memory_format=torch.channels_last)
+
+    negatives = data.read_negatives(args.negatives, args.cache) if args.negatives else None
+    if negatives is not None:
+        card |= {"negatives": len(negatives), "negative_share": args.negative_share}
 
     def batch_loss(batch, _progress):
-        images, masks = (tensor.to(args.device) for tensor in samples.pixels(batch))
+        images, masks = samples.pixels(batch)
+        if negatives is not None:
+            rows = torch.rand(len(batch), device="cpu") < args.negative_share
+            drawn = torch.randint(len(negatives), (int(rows.sum()),), device="cpu")
+            images[rows], masks[rows] = negatives[drawn].float() / 255, 0.0
+        images, masks = images.to(args.device), masks.to(args.device)
         images, masks = data.random_views(images, masks, height, width, zoom=args.zoom)
         images = data.jitter_colours(images)
         estimate = network(images.contiguous(memory_format=torch.channels_last))
@@ -222,10 +245,11 @@ def train_joint(args):
         for part, chosen in ((samples, numbers), (held_out, validation)))
     standard = Standardised.of(samples.joints[numbers])
     standard.mean, standard.deviation = standard.mean.to(args.device), standard.deviation.to(args.device)
-    card |= {"samples": len(numbers), "min_coverage": args.min_coverage, "estimated_masks": args.estimated_masks,
-             "estimated_after": args.estimated_after,
+    rule = {"rule": "threshold", "threshold": 0.5} if args.overlay == "threshold" else {"rule": "multiply"}
+    card |= {"samples": len(numbers), "overlay": rule, "min_coverage": args.min_coverage,
+             "estimated_masks": args.estimated_masks, "estimated_after": args.estimated_after,
              "mean": standard.mean.tolist(), "deviation": standard.deviation.tolist()}
-    network = Network(paper_joint_layers(args.dilations, args.pool), JOINT_INPUT)
+    network = initialise(Network(paper_joint_layers(args.dilations, args.pool), JOINT_INPUT, normalise=args.normalise))
     network = network.to(args.device, memory_format=torch.channels_last)
     joints = torch.from_numpy(samples.joints)
 
@@ -243,21 +267,21 @@ def train_joint(args):
     def batch_loss(batch, progress):
         images, masks = samples.pixels(batch)
         if estimated is not None and progress >= args.estimated_after:
-            for row in np.flatnonzero(np.random.default_rng(int(torch.randint(2**31, (), device="cpu"))).random(len(batch))
-                                      < args.estimated_masks):
+            for row in torch.nonzero(torch.rand(len(batch), device="cpu") < args.estimated_masks).flatten():
                 masks[row, 0] = torch.from_numpy(estimated[int(batch[row])]).float() / 255
         images, masks = images.to(args.device), masks.to(args.device)
-        overlays = data.erase_rectangles(data.jitter_colours(images) * masks)
+        overlays = data.erase_rectangles(overlay(data.jitter_colours(images), masks, rule))
         overlays, truth = data.rotate_camera(
             overlays, joints[batch].to(args.device), data.random_rotations(len(batch)))
         outputs = network(overlays.contiguous(memory_format=torch.channels_last))
         return losses.joint_loss(standard.metres(outputs), truth)
 
     def score():
-        figures = evaluate.score_joints(network, standard.metres, held_out, validation, None, args.device, "true_mask")
-        if held_out_estimated is not None:
-            figures |= evaluate.score_joints(
-                network, standard.metres, held_out, validation, held_out_estimated, args.device, "estimated_mask")
+        figures = {}
+        for name, masks in (("true_mask", None), ("estimated_mask", held_out_estimated)):
+            if name == "true_mask" or masks is not None:
+                figures |= evaluate.score_joints(
+                    network, standard.metres, held_out, validation, masks, rule, args.device, name)
         return figures
 
     def better(figures):
