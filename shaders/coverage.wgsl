@@ -1,15 +1,17 @@
-// Counts and bounds the pixels of each mask that reach THRESHOLD, and counts those that are not
-// finite. A workgroup reduces its 256 pixels, then adds them to its image's totals.
+// Counts and bounds the pixels of each mask that reach THRESHOLD, and counts those that reach
+// SURE_THRESHOLD and those that are not finite. A workgroup reduces its 256 pixels, then adds them to its image's totals.
 
 override WIDTH: u32;
 override HEIGHT: u32;
 override BATCH: u32;
 override THRESHOLD: f32;
+override SURE_THRESHOLD: f32;
 
 override GROUPS: u32 = (WIDTH * HEIGHT + 255u) / 256u;
 
 struct Totals {
     pixels: atomic<u32>,
+    sure: atomic<u32>,
     not_finite: atomic<u32>,
     // The greatest of WIDTH - x, HEIGHT - y, x + 1 and y + 1: zero, to which the buffer is cleared,
     // stands for no pixel.
@@ -24,6 +26,7 @@ struct Totals {
 @group(0) @binding(1) var<storage, read_write> totals: array<Totals>;
 
 var<workgroup> pixels: atomic<u32>;
+var<workgroup> sure: atomic<u32>;
 var<workgroup> not_finite: atomic<u32>;
 var<workgroup> from_right: atomic<u32>;
 var<workgroup> from_bottom: atomic<u32>;
@@ -43,6 +46,9 @@ fn main(
         let probability = mask[image * WIDTH * HEIGHT + pixel].x;
         // By its bits: a compiler may assume that a float is a number.
         let finite = (bitcast<u32>(probability) & 0x7f800000u) != 0x7f800000u;
+        if finite && probability >= SURE_THRESHOLD {
+            atomicAdd(&sure, 1u);
+        }
         if !finite {
             atomicAdd(&not_finite, 1u);
         } else if probability >= THRESHOLD {
@@ -58,6 +64,7 @@ fn main(
     workgroupBarrier();
     if local == 0u && image < BATCH {
         atomicAdd(&totals[image].not_finite, atomicLoad(&not_finite));
+        atomicAdd(&totals[image].sure, atomicLoad(&sure));
         if atomicLoad(&pixels) > 0u {
             atomicAdd(&totals[image].pixels, atomicLoad(&pixels));
             atomicMax(&totals[image].from_right, atomicLoad(&from_right));

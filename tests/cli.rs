@@ -128,7 +128,7 @@ fn model(xyz: [[f32; 3]; 6]) -> Vec<u8> {
             {"name": "pool1", "op": "max_pool2d", "inputs": ["overlay"], "size": 4},
             {"name": "dense", "op": "dense", "inputs": ["pool1"], "out_features": 18,
              "activation": "none"}]},
-        "presence": {"mask_threshold": 0.5, "min_coverage": 0.01},
+        "presence": {"mask_threshold": 0.5, "sure_threshold": 0.7, "min_sure": 0.01},
         "card": {"figures": {"mask_iou": 0.5}},
     });
     let bytes =

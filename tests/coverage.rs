@@ -9,6 +9,8 @@ use whereabot::gpu::{Tensor, Totals, coverage};
 use whereabot::network::{Coverage, Shape};
 use whereabot::reference;
 
+const SURE: f32 = 0.75;
+
 fn run(mask: &[f32], height: usize, width: usize, batch: usize, threshold: f32) -> Vec<Coverage> {
     let device = device();
     let shape = Shape::new(1, height, width);
@@ -27,7 +29,7 @@ fn run(mask: &[f32], height: usize, width: usize, batch: usize, threshold: f32) 
     let totals = buffer(U::STORAGE | U::COPY_SRC | U::COPY_DST);
     let readback = buffer(U::MAP_READ | U::COPY_DST);
     let step = device
-        .scoped(|| coverage(&device, &tensor, &totals, threshold))
+        .scoped(|| coverage(&device, &tensor, &totals, (threshold, SURE)))
         .unwrap();
     let mut encoder = device.wgpu().create_command_encoder(&Default::default());
     encoder.clear_buffer(&totals, 0, None);
@@ -48,7 +50,7 @@ fn expected(mask: &[f32], height: usize, width: usize, threshold: f32) -> Vec<Co
     mask.chunks_exact(height * width)
         .map(|mask| {
             let mask = reference::Tensor::new(Shape::new(1, height, width), mask.to_vec());
-            reference::coverage(&mask.unwrap(), threshold)
+            reference::coverage(&mask.unwrap(), threshold, SURE)
         })
         .collect()
 }
@@ -100,7 +102,13 @@ fn values_that_are_not_finite_are_counted_and_cover_nothing() {
     mask[4] = f32::INFINITY;
     let found = run(&mask, 3, 4, 1, 0.5);
     assert_eq!(found, expected(&mask, 3, 4, 0.5));
-    assert_eq!((found[0].pixels, found[0].not_finite), (10, 2));
+    let Coverage {
+        pixels,
+        sure,
+        not_finite,
+        ..
+    } = found[0];
+    assert_eq!((pixels, sure, not_finite), (10, 10, 2));
 }
 
 #[test]

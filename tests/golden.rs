@@ -11,7 +11,7 @@ use whereabot::gpu::{NetworkPlan, Tensor};
 use whereabot::network::{Model, Network, Shape};
 use whereabot::reference;
 
-const NAMES: [&str; 3] = ["tiny", "threshold", "tiny_f16"];
+const NAMES: [&str; 4] = ["tiny", "threshold", "tiny_f16", "context"];
 
 fn file(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))

@@ -20,20 +20,20 @@ pub struct Camera {
 #[non_exhaustive]
 pub enum CameraError {
     /// The file cannot be read.
-    #[error("{}: {source}", file.display())]
+    #[error("{}: {cause}", file.display())]
     Read {
         /// The file.
         file: PathBuf,
         /// Why.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// The file holds no usable camera.
-    #[error("{}: {source}", file.display())]
+    #[error("{}: {cause}", file.display())]
     File {
         /// The file.
         file: PathBuf,
         /// What is wrong with it.
-        source: Box<CameraError>,
+        cause: Box<CameraError>,
     },
     /// The text is not a `camera_info` in YAML.
     #[error("not a camera_info in YAML: {0}")]

@@ -51,13 +51,13 @@ impl Camera {
     /// As [`Camera::from_camera_info`], and what keeps the file from being read; both name the file.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, CameraError> {
         let file = path.as_ref();
-        let text = std::fs::read_to_string(file).map_err(|source| CameraError::Read {
+        let text = std::fs::read_to_string(file).map_err(|cause| CameraError::Read {
             file: file.into(),
-            source,
+            cause,
         })?;
-        Self::from_camera_info(&text).map_err(|source| CameraError::File {
+        Self::from_camera_info(&text).map_err(|cause| CameraError::File {
             file: file.into(),
-            source: Box::new(source),
+            cause: Box::new(cause),
         })
     }
 

@@ -149,12 +149,12 @@ impl Locator {
     fn estimate(&self, frame: Frame, view: &View, output: Output) -> Estimate {
         let description = &self.description;
         let (width, height) = (description.input.width, description.input.height);
-        let coverage = f64::from(frame.coverage.pixels) / f64::from(width * height);
+        let share = |pixels: u32| f64::from(pixels) / f64::from(width * height);
         let bbox_px = frame.coverage.bbox.and_then(|bbox| view.bbox(bbox));
 
         let (status, joints) = if frame.coverage.not_finite > 0 {
             (Status::Invalid, Vec::new())
-        } else if coverage < f64::from(description.presence.min_coverage) {
+        } else if share(frame.coverage.sure) < f64::from(description.presence.min_sure) {
             (Status::NotFound, Vec::new())
         } else if output.mask_only {
             (Status::Found, Vec::new())
@@ -166,7 +166,7 @@ impl Locator {
         };
         Estimate {
             status,
-            coverage: view.share_of_image(coverage),
+            coverage: view.share_of_image(share(frame.coverage.pixels)),
             bbox_px,
             field: view.field,
             joints,
@@ -207,7 +207,8 @@ fn run_reference(
     let image = reference::rectify(image, rectification, shape.height, shape.width);
     let mask =
         reference::run(&model.mask_network, &image).ok_or(LocateError::Shape("mask network"))?;
-    let coverage = reference::coverage(&mask, description.presence.mask_threshold);
+    let presence = description.presence;
+    let coverage = reference::coverage(&mask, presence.mask_threshold, presence.sure_threshold);
     let joints = if output.mask_only {
         Vec::new()
     } else {

@@ -65,7 +65,8 @@ fn card(model: &Model, file_size: usize) -> String {
          joints      {}\n\
          input       {} x {} pixels, fx {} fy {} cx {} cy {}\n\
          overlay     {overlay}\n\
-         presence    mask of at least {} on {} % of the input\n\
+         mask        probability of at least {}\n\
+         presence    probability of at least {} on {} % of the input\n\
          size        {} MMAC an image, {parameters} parameters, {} KiB\n",
         description.robot,
         description.family,
@@ -77,7 +78,8 @@ fn card(model: &Model, file_size: usize) -> String {
         camera.cx,
         camera.cy,
         description.presence.mask_threshold,
-        100.0 * description.presence.min_coverage,
+        description.presence.sure_threshold,
+        rounded_percent(description.presence.min_sure),
         millions(macs),
         file_size / 1024,
     );
@@ -144,6 +146,10 @@ fn options(operation: &Operation) -> String {
         Operation::Upsample2d { scale } => format!("x {scale}"),
         Operation::Sigmoid | Operation::Concat => String::new(),
     }
+}
+
+fn rounded_percent(share: f32) -> String {
+    format!("{:.2}", 100.0 * f64::from(share))
 }
 
 fn millions(count: u64) -> String {

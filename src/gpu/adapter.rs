@@ -1,7 +1,6 @@
 use wgpu::{AdapterInfo, Backend, Backends, DeviceType};
 
-use super::GpuError;
-use super::device::Tier;
+use super::{GpuError, Tier};
 
 /// Which adapter is wanted. A flag goes before the environment, the environment before the rule
 /// (the best real GPU).

@@ -1,4 +1,4 @@
-use super::step::{Step, StepDescriptor};
+use super::step::Step;
 use super::tensor::{Tensor, blocks};
 use super::{Device, GpuError};
 
@@ -9,31 +9,25 @@ pub(super) fn concat(
     inputs: &[&Tensor],
     output: &Tensor,
 ) -> Result<Vec<Step>, GpuError> {
+    let plane = output.shape.height * output.shape.width;
     let mut first = 0;
     inputs
         .iter()
-        .map(|input| {
+        .map(|&input| {
             let channels = input.shape.channels;
-            let plane = input.shape.height * input.shape.width;
-            let step = Step::new(
+            let step = Step::from_to(
                 device,
-                &StepDescriptor {
-                    label,
-                    source: include_str!("../../shaders/concat.wgsl"),
-                    entry_point: "main",
-                    constants: &[
-                        ("PLANE", plane as f64),
-                        ("BATCH", input.batch as f64),
-                        ("CHANNELS", channels as f64),
-                        ("FIRST", first as f64),
-                        ("OUT_BLOCKS", blocks(output.shape.channels) as f64),
-                    ],
-                    bindings: &[
-                        (0, input.buffer.as_entire_binding()),
-                        (1, output.buffer.as_entire_binding()),
-                    ],
-                    workgroups: (input.batch * channels * plane).div_ceil(64),
-                },
+                label,
+                include_str!("../../shaders/concat.wgsl"),
+                &[
+                    ("PLANE", plane as f64),
+                    ("BATCH", input.batch as f64),
+                    ("CHANNELS", channels as f64),
+                    ("FIRST", first as f64),
+                    ("OUT_BLOCKS", blocks(output.shape.channels) as f64),
+                ],
+                (input, output),
+                input.batch * channels * plane,
             );
             first += channels;
             step

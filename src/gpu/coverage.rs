@@ -10,6 +10,7 @@ use crate::network::Coverage;
 #[repr(C)]
 pub struct Totals {
     pixels: u32,
+    sure: u32,
     not_finite: u32,
     from_right: u32,
     from_bottom: u32,
@@ -22,6 +23,7 @@ impl Totals {
     pub fn coverage(&self, width: u32, height: u32) -> Coverage {
         Coverage {
             pixels: self.pixels,
+            sure: self.sure,
             not_finite: self.not_finite,
             bbox: (self.pixels > 0).then(|| {
                 [
@@ -35,8 +37,8 @@ impl Totals {
     }
 }
 
-/// Counts and bounds the pixels of each `mask` `[1, height, width]` that reach `threshold`, into
-/// `totals`: one [`Totals`] an image, cleared before each run.
+/// Counts and bounds the pixels of each `mask` `[1, height, width]` that reach the thresholds
+/// `(threshold, sure_threshold)`, into `totals`: one [`Totals`] an image, cleared before each run.
 ///
 /// # Errors
 /// More pixels than a dispatch holds. Driver errors reach the caller's [`Device::scoped`].
@@ -44,7 +46,7 @@ pub fn coverage(
     device: &Device,
     mask: &Tensor,
     totals: &wgpu::Buffer,
-    threshold: f32,
+    (threshold, sure_threshold): (f32, f32),
 ) -> Result<Step, GpuError> {
     let (height, width) = (mask.shape.height, mask.shape.width);
     Step::new(
@@ -58,6 +60,7 @@ pub fn coverage(
                 ("HEIGHT", height as f64),
                 ("BATCH", mask.batch as f64),
                 ("THRESHOLD", f64::from(threshold)),
+                ("SURE_THRESHOLD", f64::from(sure_threshold)),
             ],
             bindings: &[
                 (0, mask.buffer.as_entire_binding()),

@@ -1,4 +1,4 @@
-use super::step::{Step, StepDescriptor};
+use super::step::Step;
 use super::tensor::{Tensor, blocks};
 use super::{Device, GpuError};
 
@@ -10,26 +10,18 @@ pub(super) fn max_pool2d(
     output: &Tensor,
     size: usize,
 ) -> Result<Step, GpuError> {
-    Step::new(
+    let planes = input.batch * blocks(input.shape.channels);
+    Step::from_to(
         device,
-        &StepDescriptor {
-            label,
-            source: include_str!("../../shaders/max_pool2d.wgsl"),
-            entry_point: "main",
-            constants: &[
-                (
-                    "PLANES",
-                    (input.batch * blocks(input.shape.channels)) as f64,
-                ),
-                ("IN_HEIGHT", input.shape.height as f64),
-                ("IN_WIDTH", input.shape.width as f64),
-                ("SIZE", size as f64),
-            ],
-            bindings: &[
-                (0, input.buffer.as_entire_binding()),
-                (1, output.buffer.as_entire_binding()),
-            ],
-            workgroups: output.texels().div_ceil(64),
-        },
+        label,
+        include_str!("../../shaders/max_pool2d.wgsl"),
+        &[
+            ("PLANES", planes as f64),
+            ("IN_HEIGHT", input.shape.height as f64),
+            ("IN_WIDTH", input.shape.width as f64),
+            ("SIZE", size as f64),
+        ],
+        (input, output),
+        output.texels(),
     )
 }

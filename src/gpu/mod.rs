@@ -15,11 +15,12 @@ mod rectify;
 mod sigmoid;
 mod step;
 mod tensor;
+mod tier;
 mod upsample2d;
 
 pub use adapter::{AdapterReport, AdapterRequest, Choice, Wanted, list_adapters};
 pub use coverage::{Totals, coverage};
-pub use device::{Device, Tier};
+pub use device::Device;
 pub use error::GpuError;
 pub use network::NetworkPlan;
 pub use overlay::overlay;
@@ -27,3 +28,4 @@ pub use plan::{Frame, Plan};
 pub use rectify::Rectify;
 pub use step::Step;
 pub use tensor::Tensor;
+pub use tier::Tier;

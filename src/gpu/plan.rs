@@ -59,7 +59,9 @@ impl Plan {
                 (batch * size_of::<Totals>()) as u64,
             )?;
             let output = mask.output();
-            let coverage = coverage(device, output, &totals, description.presence.mask_threshold)?;
+            let presence = description.presence;
+            let thresholds = (presence.mask_threshold, presence.sure_threshold);
+            let coverage = coverage(device, output, &totals, thresholds)?;
             let overlay = overlay(device, &image, output, &masked, description.overlay)?;
             let results = staging_buffer(device, totals.size() + joint.output().buffer.size());
             let masks = staging_buffer(device, output.buffer.size());

@@ -1,4 +1,4 @@
-use super::step::{Step, StepDescriptor};
+use super::step::Step;
 use super::tensor::Tensor;
 use super::{Device, GpuError};
 
@@ -9,18 +9,12 @@ pub(super) fn sigmoid(
     input: &Tensor,
     output: &Tensor,
 ) -> Result<Step, GpuError> {
-    Step::new(
+    Step::from_to(
         device,
-        &StepDescriptor {
-            label,
-            source: include_str!("../../shaders/sigmoid.wgsl"),
-            entry_point: "main",
-            constants: &[("LENGTH", input.texels() as f64)],
-            bindings: &[
-                (0, input.buffer.as_entire_binding()),
-                (1, output.buffer.as_entire_binding()),
-            ],
-            workgroups: input.texels().div_ceil(64),
-        },
+        label,
+        include_str!("../../shaders/sigmoid.wgsl"),
+        &[("LENGTH", input.texels() as f64)],
+        (input, output),
+        input.texels(),
     )
 }

@@ -1,3 +1,4 @@
+use super::tensor::Tensor;
 use super::{Device, GpuError};
 
 /// One dispatch of a kernel: all that encoding it needs, made once.
@@ -63,6 +64,32 @@ impl Step {
             bind_group,
             workgroups: [x as u32, y as u32],
         })
+    }
+
+    /// A kernel that reads one tensor (binding 0) and writes another (binding 1), 64 of its
+    /// `invocations` a workgroup.
+    pub(super) fn from_to(
+        device: &Device,
+        label: &str,
+        source: &str,
+        constants: &[(&str, f64)],
+        (input, output): (&Tensor, &Tensor),
+        invocations: usize,
+    ) -> Result<Self, GpuError> {
+        Self::new(
+            device,
+            &StepDescriptor {
+                label,
+                source,
+                entry_point: "main",
+                constants,
+                bindings: &[
+                    (0, input.buffer.as_entire_binding()),
+                    (1, output.buffer.as_entire_binding()),
+                ],
+                workgroups: invocations.div_ceil(64),
+            },
+        )
     }
 
     /// Binds other resources to the same kernel.

@@ -71,8 +71,11 @@ pub enum Overlay {
 pub struct Presence {
     /// A pixel belongs to the robot from this probability on, in (0, 1).
     pub mask_threshold: f32,
-    /// Smallest share of the image that must be robot, in [0, 1].
-    pub min_coverage: f32,
+    /// A pixel surely belongs to the robot from this probability on, in (0, 1).
+    pub sure_threshold: f32,
+    /// Smallest share of the image that must surely be robot, in [0, 1]: what is not robot seldom
+    /// gets a high probability, however much of it gets a middling one.
+    pub min_sure: f32,
 }
 
 impl Description {
@@ -122,13 +125,14 @@ impl Description {
             }
         };
         inside("presence.mask_threshold", self.presence.mask_threshold)?;
+        inside("presence.sure_threshold", self.presence.sure_threshold)?;
         if let Overlay::Threshold { threshold } = self.overlay {
             inside("overlay.threshold", threshold)?;
         }
-        if !(0.0..=1.0).contains(&self.presence.min_coverage) {
+        if !(0.0..=1.0).contains(&self.presence.min_sure) {
             return Err(format!(
-                "presence.min_coverage: expected 0 to 1, found {}",
-                self.presence.min_coverage
+                "presence.min_sure: expected 0 to 1, found {}",
+                self.presence.min_sure
             ));
         }
         Ok(())

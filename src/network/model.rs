@@ -23,12 +23,12 @@ pub struct Model {
 #[non_exhaustive]
 pub enum ModelError {
     /// The file cannot be read.
-    #[error("{}: {source}", file.display())]
+    #[error("{}: {cause}", file.display())]
     Read {
         /// The file.
         file: PathBuf,
         /// Why.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// The file is not a well-formed safetensors file.
     #[error("{}: expected a safetensors file, found {problem}", file.display())]
@@ -47,12 +47,12 @@ pub enum ModelError {
         problem: String,
     },
     /// Layers and tensors do not fit.
-    #[error("{}: {source}", file.display())]
+    #[error("{}: {cause}", file.display())]
     Network {
         /// The file.
         file: PathBuf,
         /// What does not fit.
-        source: NetworkError,
+        cause: NetworkError,
     },
 }
 
@@ -66,9 +66,9 @@ impl Model {
     /// See [`ModelError`].
     pub fn load(path: impl AsRef<Path>) -> Result<Self, ModelError> {
         let path = path.as_ref();
-        let bytes = std::fs::read(path).map_err(|source| ModelError::Read {
+        let bytes = std::fs::read(path).map_err(|cause| ModelError::Read {
             file: path.into(),
-            source,
+            cause,
         })?;
         Self::from_bytes(&bytes, path)
     }
@@ -87,9 +87,9 @@ impl Model {
             file: file.into(),
             problem,
         };
-        let network = |source| ModelError::Network {
+        let network = |cause| ModelError::Network {
             file: file.into(),
-            source,
+            cause,
         };
 
         let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| format(e.to_string()))?;

@@ -197,9 +197,9 @@ fn decode(path: &Path) -> Result<RgbImage, RecordingError> {
         .map_err(RecordingError::io(path))?
         .decode();
     Ok(picture
-        .map_err(|source| RecordingError::Picture {
+        .map_err(|cause| RecordingError::Picture {
             path: path.to_owned(),
-            source,
+            cause,
         })?
         .into_rgb8())
 }

@@ -7,12 +7,12 @@ use crate::gpu::GpuError;
 #[non_exhaustive]
 pub enum RecordingError {
     /// A file or folder could not be read or written.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {cause}", path.display())]
     Io {
         /// The file or folder.
         path: PathBuf,
         /// What the system said.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// The robot description is not one that the recorder can use.
     #[error("{}: {message}", path.display())]
@@ -49,12 +49,12 @@ pub enum RecordingError {
         path: PathBuf,
     },
     /// A background picture could not be decoded.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {cause}", path.display())]
     Picture {
         /// The picture.
         path: PathBuf,
         /// What the decoder said.
-        source: image::ImageError,
+        cause: image::ImageError,
     },
     /// The output folder already holds something that this request does not continue.
     #[error("{}: {message}", path.display())]
@@ -79,6 +79,6 @@ impl RecordingError {
     /// Attaches the path to an input or output error, for `map_err`.
     pub(crate) fn io(path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.into();
-        move |source| Self::Io { path, source }
+        move |cause| Self::Io { path, cause }
     }
 }

@@ -129,7 +129,7 @@ impl Writer {
         } else {
             let text = serde_json::to_string_pretty(header).map_err(|e| RecordingError::Io {
                 path: header_path.clone(),
-                source: e.into(),
+                cause: e.into(),
             })?;
             std::fs::write(&header_path, text + "\n").map_err(RecordingError::io(&header_path))?;
         }
@@ -192,7 +192,7 @@ impl Writer {
         let path = || self.folder.join("samples.jsonl");
         let mut line = serde_json::to_string(sample).map_err(|e| RecordingError::Io {
             path: path(),
-            source: e.into(),
+            cause: e.into(),
         })?;
         line.push('\n');
         self.lines
@@ -217,7 +217,7 @@ pub fn write_picture(
     let mask_path = folder.join(&sample.mask);
     let failed = |path: &Path| {
         let path = path.to_owned();
-        move |source| RecordingError::Picture { path, source }
+        move |cause| RecordingError::Picture { path, cause }
     };
     JpegEncoder::new_with_quality(&mut jpeg, 92)
         .write_image(&picture.rgb, WIDTH, HEIGHT, ExtendedColorType::Rgb8)

@@ -23,7 +23,7 @@ pub struct Link {
     pub parent: Option<usize>,
 }
 
-/// A moving joint of the chain from the base to the tool.
+/// A joint that moves.
 #[derive(Debug)]
 pub struct Joint {
     /// The joint's name without a trailing `_joint`.
@@ -46,12 +46,13 @@ struct Step {
     moved_by: Option<(DVec3, usize)>,
 }
 
-/// A robot: what a URDF file and its meshes say.
+/// A robot: what a URDF file and its meshes say. Revolute and continuous joints move, each on its own
+/// (`mimic` is ignored); all others stay at zero.
 #[derive(Debug)]
 pub struct Robot {
     /// All links.
     pub links: Vec<Link>,
-    /// The revolute joints, base first.
+    /// The joints that move, base first.
     pub joints: Vec<Joint>,
     steps: Vec<Step>,
     base: usize,

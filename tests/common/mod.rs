@@ -171,7 +171,7 @@ pub fn description(width: u32, height: u32, filters: usize) -> serde_json::Value
             conv("conv2", "pool1", 2 * filters, 1, "relu"), pool("pool2", "conv2"),
             conv("conv3", "pool2", 4 * filters, 1, "relu"),
             {"name": "dense", "op": "dense", "inputs": ["conv3"], "out_features": 18, "activation": "none"}]},
-        "presence": {"mask_threshold": 0.5, "min_coverage": 0.01}
+        "presence": {"mask_threshold": 0.5, "sure_threshold": 0.7, "min_sure": 0.01}
     })
 }
 

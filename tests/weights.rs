@@ -1,0 +1,155 @@
+//! The shipped weights on the bundled images: kernels against reference, and both against the truth.
+#![allow(clippy::unwrap_used, clippy::panic, missing_docs)]
+
+mod common;
+
+use std::path::{Path, PathBuf};
+
+use common::{device, difference};
+use image::RgbaImage;
+use whereabot::camera::Camera;
+use whereabot::cascade::{Estimate, Locator, Output, Status};
+use whereabot::draw;
+use whereabot::network::Model;
+
+fn root(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
+}
+
+fn model() -> Model {
+    Model::load(root("weights/ur5.safetensors")).unwrap()
+}
+
+fn camera() -> Camera {
+    Camera::load(root("examples/images/camera_info.yaml")).unwrap()
+}
+
+fn sample(name: &str) -> RgbaImage {
+    image::open(root(&format!("examples/images/{name}.jpg")))
+        .unwrap()
+        .into_rgba8()
+}
+
+const ROBOTS: [&str; 6] = ["ur5_1", "ur5_2", "ur5_3", "ur5_4", "ur5_5", "ur5_6"];
+const WITH_MASK: Output = Output {
+    mask: true,
+    mask_only: false,
+};
+
+fn joints(estimate: &Estimate) -> Vec<f32> {
+    estimate
+        .joints
+        .iter()
+        .flat_map(|j| j.xyz_m.map(|v| v as f32))
+        .collect()
+}
+
+#[test]
+fn every_file_in_weights_loads() {
+    let files: Vec<PathBuf> = std::fs::read_dir(root("weights"))
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.extension().is_some_and(|e| e == "safetensors"))
+        .collect();
+    assert!(!files.is_empty());
+    for file in files {
+        Model::load(&file).unwrap();
+    }
+}
+
+#[test]
+fn gpu_and_reference_agree_on_photos() {
+    let model = model();
+    let mut gpu = Locator::on_gpu(device(), &model).unwrap();
+    let mut cpu = Locator::on_cpu(&model);
+    let mut first = None;
+    for name in ["ur5_1", "ur5_4", "no_robot"] {
+        let gpu = gpu.locate(&sample(name), &camera(), WITH_MASK).unwrap();
+        let cpu = cpu.locate(&sample(name), &camera(), WITH_MASK).unwrap();
+        let (mask, expected) = (gpu.mask.clone().unwrap(), cpu.mask.clone().unwrap());
+        let found = difference(&mask.probability, &expected.probability).unwrap();
+        assert!(found <= 1e-4, "{name}: mask differs by {found}");
+        assert_eq!(gpu.status, cpu.status, "{name}");
+        // 0.1 mm
+        let found = difference(&joints(&gpu), &joints(&cpu)).unwrap();
+        assert!(found <= 1e-4, "{name}: joints differ by {found} m");
+        // Negative control: another picture's answer.
+        let (other_mask, other_joints) =
+            first.get_or_insert((mask.probability.clone(), joints(&gpu)));
+        if name == "ur5_4" {
+            assert!(difference(other_mask, &mask.probability).unwrap() > 1e-2);
+            assert!(difference(other_joints, &joints(&gpu)).unwrap() > 1e-2);
+        }
+    }
+}
+
+/// Share of pixels in both among those in either.
+fn iou(a: &[bool], b: &[bool]) -> f64 {
+    let count = |both: fn(bool, bool) -> bool| {
+        a.iter().zip(b).filter(|&(&a, &b)| both(a, b)).count() as f64
+    };
+    count(|a, b| a && b) / count(|a, b| a || b).max(1.0)
+}
+
+#[test]
+fn the_robot_is_found_where_it_is() {
+    let model = model();
+    let mut locator = Locator::on_gpu(device(), &model).unwrap();
+    let truth: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(root("tests/data/samples/truth.json")).unwrap())
+            .unwrap();
+    let (mut total_iou, mut total_error) = (0.0, 0.0);
+    let mut wrong_iou = 0.0;
+    let mut before: Option<Vec<bool>> = None;
+    for name in ROBOTS {
+        let estimate = locator.locate(&sample(name), &camera(), WITH_MASK).unwrap();
+        assert_eq!(estimate.status, Status::Found, "{name}");
+        let found = draw::mask_image(
+            estimate.mask.as_ref().unwrap(),
+            &model.description.camera,
+            &camera(),
+            Some(model.description.presence.mask_threshold),
+        );
+        let expected = image::open(root(&format!("tests/data/samples/{name}.mask.png")))
+            .unwrap()
+            .into_luma8();
+        let robot = |mask: &image::GrayImage| mask.iter().map(|&v| v > 0).collect::<Vec<_>>();
+        let (found, expected) = (robot(&found), robot(&expected));
+        let errors: Vec<f64> = estimate
+            .joints
+            .iter()
+            .enumerate()
+            .map(|(index, joint)| {
+                let at = |axis: usize| truth[name]["joints_m"][index][axis].as_f64().unwrap();
+                (0..3)
+                    .map(|axis| (joint.xyz_m[axis] - at(axis)).powi(2))
+                    .sum::<f64>()
+                    .sqrt()
+            })
+            .collect();
+        let error = errors.iter().sum::<f64>() / errors.len() as f64;
+        println!(
+            "{name}: IoU {:.3}, joints off by {:.1} cm",
+            iou(&found, &expected),
+            100.0 * error
+        );
+        total_iou += iou(&found, &expected) / ROBOTS.len() as f64;
+        total_error += error / ROBOTS.len() as f64;
+        wrong_iou += before.map_or(0.0, |other| iou(&other, &expected)) / ROBOTS.len() as f64;
+        before = Some(found);
+    }
+    assert!(total_iou >= 0.6, "{total_iou}");
+    assert!(total_error <= 0.25, "{total_error}");
+    // Negative control: the mask of the picture before does not pass.
+    assert!(wrong_iou < 0.4, "{wrong_iou}");
+}
+
+#[test]
+fn without_a_robot_nothing_is_found() {
+    let mut locator = Locator::on_gpu(device(), &model()).unwrap();
+    let estimate = locator
+        .locate(&sample("no_robot"), &camera(), WITH_MASK)
+        .unwrap();
+    assert_eq!(estimate.status, Status::NotFound);
+    assert!(estimate.joints.is_empty());
+}
