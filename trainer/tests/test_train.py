@@ -7,7 +7,7 @@ from safetensors.torch import load_file
 
 from whereabot_trainer import data, evaluate, golden
 from whereabot_trainer.__main__ import main
-from whereabot_trainer.export import choose_presence, read_model
+from whereabot_trainer.export import SURE_THRESHOLDS, choose_presence, read_model
 from whereabot_trainer.networks import (
     JOINT_INPUT, MASK_INPUT, Network, context_mask_layers, paper_joint_layers, paper_mask_layers)
 from whereabot_trainer.train import Standardised, load_network
@@ -81,12 +81,17 @@ def test_export_folds_calibration_and_standardisation(train, recording, tmp_path
     assert not torch.allclose(joint(images), trained_joint(images), atol=1e-2)
 
 
-def test_presence_threshold_rejects_nine_of_ten():
-    without = [0.0] * 7 + [0.01, 0.02, 0.3]
-    least = choose_presence(without)
-    assert least == pytest.approx(0.0201, abs=1e-4) and sum(value < least for value in without) == 9
-    assert choose_presence(without, rejected=1.0) > 0.3
-    assert choose_presence([]) == 0.001
+def test_presence_rejects_images_without_a_robot_and_finds_the_most_robots():
+    robots = {threshold: [0.05, 0.1, 0.2] for threshold in SURE_THRESHOLDS}
+    without = {threshold: [0.0] * 19 + [0.3] + [0.08] * 19 + [0.3] for threshold in SURE_THRESHOLDS}
+    without[0.9] = [0.0] * 38 + [0.3, 0.4]
+    assert choose_presence(robots, without) == (0.9, 0.001)
+    robots[0.9], without[0.9] = [0.07, 0.1, 0.2], [0.0] * 37 + [0.06, 0.3, 0.4]
+    threshold, least = choose_presence(robots, without)
+    assert threshold == 0.9 and 0.06 < least < 0.061
+    robots[0.95] = [0.09, 0.1, 0.2]
+    threshold, least = choose_presence(robots, without)
+    assert threshold == 0.95 and 0.08 < least < 0.081
 
 
 def test_calibration_finds_the_best_threshold():

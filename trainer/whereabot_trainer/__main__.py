@@ -105,7 +105,7 @@ def main(argv=None):
     command.add_argument("--photos", metavar="DIR", help="annotated photos, to report the mask's IoU on")
     command.add_argument("--annotations", metavar="FILE", help="annotations of --photos")
     command.add_argument("--photos-without", nargs="*", default=[], metavar="DIR",
-                         help="photos without a robot, to choose the presence threshold on")
+                         help="folders of photos without a robot, to report how many are rejected")
     command.add_argument("--out", required=True, metavar="FILE")
     command.add_argument("--dtype", choices=("f32", "f16"), default="f32", help="of the tensors (%(default)s)")
     command.add_argument("--robot", default="ur5", help="(%(default)s)")

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -59,13 +60,25 @@ def read_model(path):
 
 # --- from training runs to a model file ------------------------------------------------------------------------------
 
-def choose_presence(without, rejected=0.9):
-    """The least mask coverage at which a robot counts as seen: the smallest that rejects this share of the images
-    without one, given by the coverages of their masks; so as few small robots as possible are missed."""
-    without = np.sort(without)
-    least = without[math.ceil(rejected * len(without)) - 1] if len(without) else 0.0
-    # Below a thousandth of the image (54 pixels) nothing can be said about a robot's joints.
-    return max(0.001, math.ceil(least * 1e4 + 1) / 1e4)
+SURE_THRESHOLDS = (0.7, 0.8, 0.9, 0.95)
+
+
+def choose_presence(robots, without, passing=0.05):
+    """When a robot counts as seen: (T, S), at least the share S of pixels having at least the probability T.
+
+    `robots` and `without` give, for each T of SURE_THRESHOLDS, the shares of images with a robot and without one. For
+    each T, S lets at most the share `passing` of the images without a robot pass; of these pairs, it is the one that
+    lets the most robots pass.
+    """
+    choices = []
+    for threshold in SURE_THRESHOLDS:
+        shares = np.sort(without[threshold])[::-1]
+        highest = shares[int(passing * len(shares))] if len(shares) else 0.0
+        # Below a thousandth of the image (54 pixels) nothing can be said about a robot's joints.
+        least = max(0.001, math.ceil(highest * 1e4 + 0.5) / 1e4)
+        choices.append((float((np.asarray(robots[threshold]) >= least).mean()), threshold, least))
+    _, threshold, least = max(choices)
+    return threshold, least
 
 
 def export_runs(args):
@@ -86,17 +99,16 @@ def export_runs(args):
     if len(reported) < args.validation_samples:
         chosen = reported = np.arange(len(samples))
 
-    coverage = {}
     estimated = evaluate.estimate_masks(mask, samples, order, args.device)
-    for number, estimate in estimated.items():
-        coverage[number] = float((estimate >= 128).mean())
     seen = samples.has_robot & (samples.coverage >= joint_state["card"]["min_coverage"])
     empty = samples.coverage == 0
-    without = [coverage[n] for n in chosen if empty[n]]
-    photos_without = {}
-    for folder in args.photos_without:
-        photos_without |= photos.coverages(mask, folder)
-    least = choose_presence(without + list(photos_without.values()))
+
+    def shares(numbers, threshold):
+        return [float((estimated[n] >= 255 * threshold).mean()) for n in numbers]
+
+    sure, least = choose_presence(*(
+        {threshold: shares(chosen[kind[chosen]], threshold) for threshold in SURE_THRESHOLDS}
+        for kind in (seen, empty)))
 
     robots = reported[seen[reported]]
     measured = evaluate.score_mask(mask, samples, reported, args.device)
@@ -104,20 +116,25 @@ def export_runs(args):
     for name, masks in (("true_mask", None), ("estimated_mask", estimated)):
         figures |= evaluate.score_joints(
             joint, evaluate.identity_metres, samples, robots, masks, rule, args.device, name)
-    found = robots[[coverage[n] >= least for n in robots]]
-    figures |= {"found_" + key: value for key, value in evaluate.score_joints(
-        joint, evaluate.identity_metres, samples, found, estimated, rule, args.device, "estimated_mask").items()}
-    nothing = [coverage[n] for n in reported if empty[n]]
-    figures["presence"] = {
-        "robots_found": _rate([coverage[n] >= least for n in robots]),
-        "images_without_robot_rejected": _rate([value < least for value in nothing]),
-        "photos_without_robot_rejected": _rate([value < least for value in photos_without.values()]),
-    }
+    found = robots[np.asarray(shares(robots, sure)) >= least]
+    if len(found):
+        figures |= evaluate.score_joints(
+            joint, evaluate.identity_metres, samples, found, estimated, rule, args.device, "found_estimated_mask")
+    figures["presence"] = {}
+    for part, numbers in (("chosen", chosen), ("reported", reported)):
+        figures["presence"] |= {
+            f"{part}_robots_found": _rate(value >= least for value in shares(numbers[seen[numbers]], sure)),
+            f"{part}_without_robot_rejected": _rate(value < least for value in shares(numbers[empty[numbers]], sure))}
+    for folder in args.photos_without:
+        values = photos.coverages(mask, folder, sure).values()
+        figures["presence"][f"photos_{Path(folder).name}_rejected"] = _rate(value < least for value in values)
     figures["samples"] = {"chosen_on": len(chosen), "reported_on": len(reported), "with_robot": len(robots)}
     if args.photos:
         scores = photos.score_annotated(mask, args.photos, args.annotations)
         figures["photos"] = {"mean_iou": round(float(np.mean(list(scores.values()))), 3),
                              "median_iou": round(float(np.median(list(scores.values()))), 3), "count": len(scores)}
+        values = photos.coverages(mask, args.photos, sure)
+        figures["photos"]["found"] = _rate(values[name] >= least for name in scores)
         print(json.dumps(scores, indent=1))
 
     card = {
@@ -131,13 +148,14 @@ def export_runs(args):
     }
     description = describe(
         mask.layers, joint.layers, family=mask_state["card"]["family"], robot=args.robot, overlay=rule,
-        presence={"mask_threshold": 0.5, "min_coverage": least}, card=card)
+        presence={"mask_threshold": 0.5, "sure_threshold": sure, "min_sure": least}, card=card)
     write_model(args.out, mask, joint, description, args.dtype)
     print(json.dumps({"chosen": description["presence"], "figures": figures}, indent=1))
     print(f"{args.out}: {os.path.getsize(args.out) / 1e6:.2f} MB")
 
 
 def _rate(hits):
+    hits = list(hits)
     return f"{sum(hits)} of {len(hits)}"
 
 

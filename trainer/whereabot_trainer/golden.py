@@ -114,7 +114,7 @@ def write_golden(folder, seed=1):
         description = describe(
             layers, JOINT_LAYERS, family=family, robot="golden", overlay=rule, width=width, height=height,
             camera={"fx": 14.25, "fy": 14.25, "cx": (width - 1) / 2, "cy": (height - 1) / 2},
-            presence={"mask_threshold": 0.5, "min_coverage": 0.01}, card=CARD)
+            presence={"mask_threshold": 0.5, "sure_threshold": 0.7, "min_sure": 0.01}, card=CARD)
         path = folder / f"{name}.safetensors"
         write_model(path, mask, joint, description, dtype)
         stored_mask, stored_joint, _ = read_model(path)
