@@ -109,6 +109,7 @@ def main(argv=None):
     command.add_argument("--out", required=True, metavar="FILE")
     command.add_argument("--dtype", choices=("f32", "f16"), default="f32", help="of the tensors (%(default)s)")
     command.add_argument("--robot", default="ur5", help="(%(default)s)")
+    command.add_argument("--note", default="", metavar="TEXT", help="what the card is to say about the data")
     command.add_argument("--licence", default="MIT OR Apache-2.0", help="of the weights (%(default)s)")
     _machine_flags(command)
     command.set_defaults(run=_run(export.export_runs))

@@ -139,7 +139,8 @@ def export_runs(args):
 
     card = {
         "task": "mask and joints (metres, camera optical frame) of one robot arm in one colour image",
-        "data": {"training": joint_state["card"]["training_recordings"], "validation": samples.sources},
+        "data": {"training": joint_state["card"]["training_recordings"], "validation": samples.sources,
+                 "note": args.note},
         "mask_training": _training(mask_state), "joint_training": _training(joint_state),
         "calibration": {"logit_shift": shift, "why": "inverse class weights bias the mask towards the robot; the shift"
                         " that gives the best validation IoU at 0.5 is added to the last bias"},
