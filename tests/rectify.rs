@@ -211,3 +211,21 @@ fn beyond_the_lens_there_is_black() {
         assert!(values[32 * 64 + 32] > 0.99);
     }
 }
+
+#[test]
+fn more_workgroups_than_one_dimension_holds() {
+    let (width, height) = (2100_u32, 2050_u32);
+    let camera = Camera::from_hfov(64, 60, 1.4);
+    let image = picture(64, 60, 5);
+    let params = Rectification::new(&camera, &canonical(width, height), width, height);
+    let (columns, rows) = (width as usize, height as usize);
+    let expected = reference::rectify(&image, &params, rows, columns);
+    let found = on_gpu(&image, &params, columns, rows);
+    assert!(difference(&found, expected.data()).unwrap() <= 2e-4);
+    // Negative control: the last row holds more than zeros.
+    assert!(
+        found[columns * rows - columns..columns * rows]
+            .iter()
+            .any(|&v| v > 0.1)
+    );
+}
