@@ -11,6 +11,13 @@ const CANONICAL: Intrinsics = Intrinsics {
     cy: 105.5,
 };
 
+const CANONICAL_CAMERA: Camera = Camera {
+    width: 256,
+    height: 212,
+    intrinsics: CANONICAL,
+    distortion: Distortion::None,
+};
+
 fn camera(distortion: Distortion) -> Camera {
     Camera {
         width: 640,
@@ -196,19 +203,19 @@ fn the_field_is_the_share_that_the_canonical_camera_sees() {
         intrinsics: CANONICAL,
         distortion: Distortion::None,
     };
-    assert_eq!(twin.field_of(&CANONICAL, 256, 212), 1.0);
+    assert_eq!(twin.field_of(&CANONICAL_CAMERA), 1.0);
     // Half the focal length: twice the field each way.
     let mut wide = twin;
     wide.intrinsics.fx /= 2.0;
     wide.intrinsics.fy /= 2.0;
-    let field = wide.field_of(&CANONICAL, 256, 212);
+    let field = wide.field_of(&CANONICAL_CAMERA);
     assert!((field - 0.25).abs() < 0.02, "{field}");
     // One pixel looks straight ahead.
-    assert_eq!(Camera::assumed(1, 1).field_of(&CANONICAL, 256, 212), 1.0);
+    assert_eq!(Camera::assumed(1, 1).field_of(&CANONICAL_CAMERA), 1.0);
     // A camera whose principal point is far off looks past it.
     let mut aside = twin;
     aside.intrinsics.cx = 5000.0;
-    assert_eq!(aside.field_of(&CANONICAL, 256, 212), 0.0);
+    assert_eq!(aside.field_of(&CANONICAL_CAMERA), 0.0);
 }
 
 const CALIBRATOR: &str = "\

@@ -129,15 +129,17 @@ impl Camera {
         self.lens().unproject(pixel)
     }
 
-    /// Share of this camera's image, in [0, 1], that the pinhole camera `canonical` with images of
-    /// `width` x `height` sees as well. Counted on a grid of up to 64 x 64 pixels.
-    pub fn field_of(&self, canonical: &Intrinsics, width: u32, height: u32) -> f64 {
+    /// Share of this camera's image, in [0, 1], that `other`, in the same place, sees as well.
+    /// Counted on a grid of up to 64 x 64 pixels.
+    pub fn field_of(&self, other: &Self) -> f64 {
         const MOST: u32 = 64;
-        let lens = self.lens();
+        let (lens, other_lens) = (self.lens(), other.lens());
         let (columns, rows) = (self.width.min(MOST), self.height.min(MOST));
         let centre = |index: u32, count: u32, size: u32| {
             (f64::from(index) + 0.5) * f64::from(size) / f64::from(count) - 0.5
         };
+        // Pixels reach half a pixel beyond their centres.
+        let within = |at: f64, side: u32| (-0.5..=f64::from(side) - 0.5).contains(&at);
         let seen = (0..rows)
             .flat_map(|row| (0..columns).map(move |column| (column, row)))
             .filter(|&(column, row)| {
@@ -146,7 +148,8 @@ impl Camera {
                     centre(row, rows, self.height),
                 ];
                 lens.unproject(pixel)
-                    .is_some_and(|ray| canonical.sees(ray, width, height))
+                    .and_then(|[x, y]| other_lens.project([x, y, 1.0]))
+                    .is_some_and(|[u, v]| within(u, other.width) && within(v, other.height))
             })
             .count();
         seen as f64 / f64::from((columns * rows).max(1))

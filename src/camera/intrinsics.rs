@@ -26,12 +26,4 @@ impl Intrinsics {
     pub fn pixel(&self, [x, y]: [f64; 2]) -> [f64; 2] {
         [self.fx * x + self.cx, self.fy * y + self.cy]
     }
-
-    /// Whether a ray `[x / z, y / z]` falls on an image of `width` x `height`, whose pixels reach half
-    /// a pixel beyond their centres.
-    pub fn sees(&self, ray: [f64; 2], width: u32, height: u32) -> bool {
-        let [u, v] = self.pixel(ray);
-        (-0.5..=f64::from(width) - 0.5).contains(&u)
-            && (-0.5..=f64::from(height) - 0.5).contains(&v)
-    }
 }

@@ -3,10 +3,10 @@
 pub enum Status {
     /// A robot, with joints.
     Found,
-    /// No robot: the mask covers too little. There are no joints.
+    /// No robot: too few pixels surely belong to one. There are no joints.
     NotFound,
-    /// A robot by its mask, but joints that cannot be: not finite, behind the camera or away from
-    /// the mask. There are no joints.
+    /// A mask that is not finite, or joints that cannot be: not finite, behind the camera or where
+    /// its lens shows nothing. There are no joints.
     Invalid,
 }
 

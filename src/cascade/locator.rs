@@ -81,7 +81,7 @@ impl Locator {
         })
     }
 
-    /// Runs `model` in plain Rust, on all cores: slower, and without a GPU.
+    /// Runs `model` in plain Rust, on all cores, without a GPU.
     pub fn on_cpu(model: &Model) -> Self {
         Self {
             engine: Engine::Cpu {

@@ -1,4 +1,4 @@
-use crate::camera::{Camera, Intrinsics, Lens, Rectification};
+use crate::camera::{Camera, Distortion, Intrinsics, Lens, Rectification};
 
 /// What the networks see of a camera's image.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -12,25 +12,26 @@ pub(super) struct View {
     /// Share of the image that lies within the canonical camera's field, in [0, 1].
     pub field: f64,
     /// Share of the canonical image that shows the camera's image, in [0, 1].
-    pub filled: f64,
+    filled: f64,
 }
 
 impl View {
     /// From `camera` to the pinhole `canonical` with images of `width` x `height`.
     pub fn new(camera: &Camera, canonical: &Intrinsics, width: u32, height: u32) -> Self {
-        let mut view = Self {
+        let pinhole = Camera {
+            width,
+            height,
+            intrinsics: *canonical,
+            distortion: Distortion::None,
+        };
+        Self {
             camera: *camera,
             lens: camera.lens(),
             canonical: *canonical,
             rectification: Rectification::new(camera, canonical, width, height),
-            field: camera.field_of(canonical, width, height),
-            filled: 0.0,
-        };
-        view.filled = share(width, height, |pixel| {
-            view.source_pixel(pixel)
-                .is_some_and(|at| at == view.clamp(at))
-        });
-        view
+            field: camera.field_of(&pinhole),
+            filled: pinhole.field_of(camera),
+        }
     }
 
     /// Whether this is the view of `camera`.
@@ -86,15 +87,4 @@ impl View {
         }
         bounds
     }
-}
-
-/// Share of the pixels of an image of `width` x `height` that fulfil `condition`, by a grid.
-fn share(width: u32, height: u32, condition: impl Fn([f64; 2]) -> bool) -> f64 {
-    const GRID: u32 = 64;
-    let at =
-        |step: u32, side: u32| (f64::from(step) + 0.5) / f64::from(GRID) * f64::from(side) - 0.5;
-    let count = (0..GRID * GRID)
-        .filter(|i| condition([at(i % GRID, width), at(i / GRID, height)]))
-        .count();
-    count as f64 / f64::from(GRID * GRID)
 }

@@ -247,7 +247,7 @@ fn device_type(kind: DeviceType) -> &'static str {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used, clippy::panic)]
+#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
 
@@ -280,26 +280,26 @@ mod tests {
         }
     }
 
+    fn chosen(reports: &[AdapterReport], request: &AdapterRequest) -> Option<usize> {
+        choose(reports, request).ok().map(|choice| choice.index)
+    }
+
     #[test]
     fn the_best_real_gpu_is_chosen_on_its_native_backend() {
-        let choice = choose(&three(), &AdapterRequest::default()).unwrap();
-        assert_eq!(choice.index, 2);
+        assert_eq!(chosen(&three(), &AdapterRequest::default()), Some(2));
     }
 
     #[test]
     fn an_unusable_adapter_is_passed_over() {
         let mut reports = three();
         reports[2].unusable = Some("no compute shaders".into());
-        assert_eq!(
-            choose(&reports, &AdapterRequest::default()).unwrap().index,
-            1
-        );
+        assert_eq!(chosen(&reports, &AdapterRequest::default()), Some(1));
     }
 
     #[test]
     fn a_name_in_any_case_or_an_index_is_found() {
-        assert_eq!(choose(&three(), &wants("LLVM")).unwrap().index, 0);
-        assert_eq!(choose(&three(), &wants("1")).unwrap().index, 1);
+        assert_eq!(chosen(&three(), &wants("LLVM")), Some(0));
+        assert_eq!(chosen(&three(), &wants("1")), Some(1));
     }
 
     #[test]
