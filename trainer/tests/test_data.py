@@ -30,7 +30,19 @@ def test_reads_a_recording_and_its_growth(recording, tmp_path):
         assert torch.equal(left, right)
     assert whole.has_robot.sum() == 36 and whole.coverage[9] == 0
     # What was on the validation side before stays there.
-    assert set(data.split(first, 1)[1]) == {n for n in data.split(grown, 1)[1] if n < 7}
+    assert set(data.split(first)[1]) == {n for n in data.split(grown)[1] if n < 7}
+
+
+def test_one_sample_in_five_is_for_testing():
+    assert np.flatnonzero(data.is_test(np.arange(40))).tolist() == [0, 1, 5, 7, 9, 16, 23, 26, 31, 35]
+    assert 0.19 < data.is_test(np.arange(10000)).mean() < 0.21
+
+
+def test_an_arm_is_measured_from_the_shoulder_to_the_wrist():
+    joints = np.zeros((3, 6, 3))
+    joints[:, 2, 0], joints[:, 3:, 0] = 0.5, 0.9
+    joints[2] = np.nan
+    assert data.arm_length(joints) == pytest.approx(0.9)
 
 
 @pytest.mark.parametrize(("line", "complaint"), [

@@ -127,11 +127,12 @@ class Samples:
     """Samples of one or more recordings, by number.
 
     `joints` is [N, 6, 3] in metres in the camera's optical frame, NaN where there is no robot; `coverage` [N] is the
-    share of robot pixels; `ids` [N] are the samples' ids in their recordings.
+    share of robot pixels; `ids` [N] are the samples' ids in their recordings; `robots` [N] are the robots' names.
+    `arms` [N] is the length of the robot's arm in metres (see `arm_length`): all recordings of a robot have the same.
     """
 
     def __init__(self, folders, cache):
-        self.parts, joints, coverage, ids, self.sources = [], [], [], [], []
+        self.parts, joints, coverage, ids, robots, self.sources = [], [], [], [], [], []
         for folder in folders:
             header, samples = read_header(folder), read_samples(folder)
             if not samples:
@@ -142,10 +143,16 @@ class Samples:
             joints += [sample.get("joints_m", absent) for sample in samples]
             coverage.append(masks.mean((1, 2)))
             ids += [sample["id"] for sample in samples]
-            self.sources.append({"name": Path(folder).name, "samples": len(samples), **header.get("source", {})})
+            robots += [header["robot"]] * len(samples)
+            self.sources.append({"name": Path(folder).name, "robot": header["robot"], "samples": len(samples),
+                                 **header.get("source", {})})
         self.joints = np.asarray(joints, np.float32)
         self.coverage = np.concatenate(coverage)
         self.ids = np.asarray(ids)
+        self.robots = np.asarray(robots)
+        self.arms = np.empty(len(self.joints), np.float32)
+        for robot in set(robots):
+            self.arms[self.robots == robot] = arm_length(self.joints[self.robots == robot])
         self._starts = np.cumsum([0] + [len(images) for images, _ in self.parts])
 
     def __len__(self):
@@ -184,13 +191,30 @@ def read_negatives(folders, cache):
     return torch.from_numpy(np.load(stored))
 
 
-def split(samples, seed, validation_share=0.2):
-    """(training, validation) numbers, at random by seed.
+def arm_length(joints):
+    """Shoulder to elbow to wrist, metres: the median over samples [N, 6, 3]; 1 where no sample has a robot.
 
-    Each sample's side depends on its id alone, so a recording that has grown since keeps its split.
+    Robots of one make are nearly the same but for their size; in this unit, they are nearly the same.
     """
-    draws = np.array([np.random.default_rng([seed, int(number)]).random() for number in samples.ids])
-    return np.flatnonzero(draws >= validation_share), np.flatnonzero(draws < validation_share)
+    shoulder, elbow, wrist = (joints[:, JOINTS.index(name)] for name in ("shoulder_lift", "elbow", "wrist_1"))
+    lengths = np.linalg.norm(elbow - shoulder, axis=1) + np.linalg.norm(wrist - elbow, axis=1)
+    lengths = lengths[np.isfinite(lengths)]
+    return float(np.median(lengths)) if len(lengths) else 1.0
+
+
+def is_test(ids):
+    """Which samples of a recording are kept for testing: one in five, told by splitmix64 of the sample's id, as
+    everything that reads recordings does it (paper, section 2: 80 % and 20 % at random)."""
+    z = (np.asarray(ids, np.uint64) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return (z ^ (z >> np.uint64(31))) % np.uint64(5) == 0
+
+
+def split(samples):
+    """(training, test) numbers."""
+    test = is_test(samples.ids)
+    return np.flatnonzero(~test), np.flatnonzero(test)
 
 
 # --- augmentation ----------------------------------------------------------------------------------------------------
