@@ -97,12 +97,24 @@ def test_views_keep_image_and_mask_together():
     assert 0.1 < masks.mean() < 0.9
 
 
+def test_colours_vary_about_the_image():
+    torch.manual_seed(0)
+    image = np.random.default_rng(0).integers(0, 256, (1, 32, 40, 3), np.uint8)
+    varied = data.jitter_colours(image.repeat(64, 0))
+    assert varied.shape == (64, 3, 32, 40) and varied.min() >= 0 and varied.max() <= 1
+    plain = torch.from_numpy(image[0]).permute(2, 0, 1) / 255
+    assert (varied.mean(0) - plain).abs().mean() < 0.06
+    assert (varied - plain).abs().mean((1, 2, 3)).min() > 0.005
+    # Colours stay where they were.
+    assert torch.corrcoef(torch.stack([varied[3].flatten(), plain.flatten()]))[0, 1] > 0.8
+
+
 def test_negatives_fill_the_input(tmp_path):
     Image.new("RGB", (90, 30), (10, 200, 30)).save(tmp_path / "wide.png")
     Image.new("L", (30, 90), 7).save(tmp_path / "tall.jpg")
     for _ in range(2):
         photographs = data.read_negatives([tmp_path], tmp_path / "cache")
-        assert photographs.shape == (2, 3, INPUT_HEIGHT, INPUT_WIDTH)
-        assert photographs[1, :, 100, 100].tolist() == [10, 200, 30]
+        assert photographs.shape == (2, INPUT_HEIGHT, INPUT_WIDTH, 3)
+        assert photographs[1, 100, 100].tolist() == [10, 200, 30]
     with pytest.raises(data.RecordingError, match="no photographs"):
         data.read_negatives([tmp_path / "cache"], tmp_path / "cache")

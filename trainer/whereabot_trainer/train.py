@@ -196,14 +196,13 @@ def train_mask(args):
         card |= {"negatives": len(negatives), "negative_share": args.negative_share}
 
     def batch_loss(batch, _progress):
-        images, masks = samples.pixels(batch)
+        images, masks = samples.bytes(batch)
         if negatives is not None:
             rows = torch.rand(len(batch), device="cpu") < args.negative_share
             drawn = torch.randint(len(negatives), (int(rows.sum()),), device="cpu")
-            images[rows], masks[rows] = negatives[drawn].float() / 255, 0.0
-        images, masks = images.to(args.device), masks.to(args.device)
+            images[rows.numpy()], masks[rows] = negatives[drawn.numpy()], 0.0
+        images, masks = data.jitter_colours(images).to(args.device), masks.to(args.device)
         images, masks = data.random_views(images, masks, height, width, zoom=args.zoom)
-        images = data.jitter_colours(images)
         estimate = network(images.contiguous(memory_format=torch.channels_last))
         return losses.mask_loss(estimate, masks, w_fg, w_bg)
 
@@ -327,12 +326,12 @@ def train_joint(args):
         raise SystemExit("--estimated-masks needs --mask-run")
 
     def batch_loss(batch, progress):
-        images, masks = samples.pixels(batch)
+        images, masks = samples.bytes(batch)
         if estimated is not None and progress >= args.estimated_after:
             for row in torch.nonzero(torch.rand(len(batch), device="cpu") < args.estimated_masks).flatten():
                 masks[row, 0] = torch.from_numpy(estimated[int(batch[row])]).float() / 255
-        images, masks = images.to(args.device), masks.to(args.device)
-        overlays = data.erase_rectangles(overlay(data.jitter_colours(images), masks, rule))
+        images, masks = data.jitter_colours(images).to(args.device), masks.to(args.device)
+        overlays = data.erase_rectangles(overlay(images, masks, rule))
         overlays, truth = data.rotate_camera(
             overlays, joints[batch].to(args.device), data.random_rotations(len(batch)))
         values = network.activations(overlays.contiguous(memory_format=torch.channels_last))
