@@ -1,5 +1,6 @@
 import csv
 import json
+import math
 
 import pytest
 import torch
@@ -9,8 +10,9 @@ from whereabot_trainer import data, evaluate, golden
 from whereabot_trainer.__main__ import main
 from whereabot_trainer.export import SURE_THRESHOLDS, choose_presence, read_model
 from whereabot_trainer.networks import (
-    JOINT_INPUT, MASK_INPUT, Network, context_mask_layers, paper_joint_layers, paper_mask_layers)
-from whereabot_trainer.train import Standardised, load_network
+    JOINT_INPUT, MASK_INPUT, Network, back_project, context_mask_layers, heatmap_joint_layers, paper_joint_layers,
+    paper_mask_layers, soft_argmax2d)
+from whereabot_trainer.train import heat_loss, load_network, output_unit
 
 
 @pytest.fixture
@@ -60,9 +62,10 @@ def test_a_run_is_not_overwritten(train):
         train("train-mask", "run", *flags)
 
 
-def test_export_folds_calibration_and_standardisation(train, recording, tmp_path):
+@pytest.mark.parametrize("family", ["paper", "context"])
+def test_export_folds_calibration_and_unit(train, recording, tmp_path, family):
     mask_run = train("train-mask", "mask", "--iterations", "3", "--crop", "32", "24", "--validation-samples", "4")
-    joint_run = train("train-joint", "joint", "--iterations", "3", "--pool", "4", "--validation-samples", "4",
+    joint_run = train("train-joint", "joint", "--family", family, "--iterations", "3", "--pool", "4", "--validation-samples", "4",
                       "--mask-run", str(mask_run), "--estimated-masks", "0.5")
     path = tmp_path / "model.safetensors"
     main(["export", "--mask", str(mask_run), "--joint", str(joint_run), "--validation", str(recording),
@@ -76,7 +79,8 @@ def test_export_folds_calibration_and_standardisation(train, recording, tmp_path
     shift = mask_state["figures"]["logit_shift"]
     assert torch.allclose(mask(images), torch.sigmoid(torch.logit(trained_mask(images)) + shift), atol=1e-5)
     assert not torch.allclose(mask(images), trained_mask(images), atol=1e-2)
-    metres = Standardised(joint_state["card"]["mean"], joint_state["card"]["deviation"]).metres(trained_joint(images))
+    arms = torch.full((2,), float(data.Samples([recording], tmp_path / "cache").arms[0]))
+    metres = output_unit(joint_state["card"]).metres(trained_joint(images), arms)
     assert torch.allclose(joint(images).reshape(-1, 6, 3), metres, atol=1e-4)
     assert not torch.allclose(joint(images), trained_joint(images), atol=1e-2)
 
@@ -152,3 +156,28 @@ def test_a_network_refuses_what_it_cannot_build():
     with pytest.raises(ValueError, match="nowhere"):
         Network(layers, JOINT_INPUT)
     assert json.dumps(paper_joint_layers())
+
+
+def test_soft_argmax_finds_a_joint_between_cells_and_beyond_the_edge():
+    heat = torch.full((1, 2, 3, 4), -50.0)
+    votes = torch.zeros(1, 6, 3, 4)
+    # The first joint lies between columns 1 and 2 of row 2; the second is voted for from the corner, far outside.
+    heat[0, 0, 2, 1] = heat[0, 0, 2, 2] = heat[0, 1, 0, 0] = 50.0
+    votes[0, 2] = 0.7
+    votes[0, 3:5, 0, 0] = torch.tensor([-9.0, -8.0])
+    found = soft_argmax2d(heat, votes, (10.0, 20.0), (2.0, 4.0)).flatten().tolist()
+    assert found == pytest.approx([13.0, 28.0, 0.7, 1.0, 12.0, 0.0])
+    points = back_project(torch.tensor([0.5, -0.25, 0.7]).reshape(1, 3, 1, 1)).flatten().tolist()
+    assert points == pytest.approx([0.5 * math.exp(0.7), -0.25 * math.exp(0.7), math.exp(0.7)])
+
+
+def test_the_heat_maps_are_drawn_to_the_joints_in_view():
+    place = {"origin": [-1.0, -1.0], "step": [0.5, 0.5]}
+    truth = torch.tensor([[[0.5, -0.5, 1.0], [9.0, 0.0, 1.0]]])
+    right, wrong = torch.zeros(1, 2, 5, 5), torch.zeros(1, 2, 5, 5)
+    right[0, 0, 1, 3] = wrong[0, 0, 3, 1] = 1.5
+    assert heat_loss(right, place, truth) < heat_loss(torch.zeros(1, 2, 5, 5), place, truth)
+    assert heat_loss(torch.zeros(1, 2, 5, 5), place, truth) < heat_loss(wrong, place, truth)
+    beyond = right.clone()
+    beyond[0, 1, 2, 2] = 30.0
+    assert heat_loss(beyond, place, truth) == heat_loss(right, place, truth)

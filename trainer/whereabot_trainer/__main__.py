@@ -83,6 +83,10 @@ def main(argv=None):
 
     command = commands.add_parser("train-joint", help="train the joint network")
     _training_flags(command, minutes=35, batch=16, learning_rate=(2e-3, 2e-5), momentum=(0.9, 0.95), dilations=(1, 2, 4))
+    command.add_argument("--family", choices=("paper", "context"), default="paper",
+                         help="the paper's network, or heat maps with votes, without --dilations and --pool (%(default)s)")
+    command.add_argument("--heat-weight", type=float, default=0.02, metavar="W",
+                         help="weight of the heat maps' own loss, context family alone (%(default)s)")
     command.add_argument("--pool", type=int, default=4, metavar="P", help="size of both max-pools (%(default)s)")
     command.add_argument("--overlay", choices=("threshold", "multiply"), default="threshold",
                          help="colour where the mask is at least 0.5, or colour times mask (%(default)s)")

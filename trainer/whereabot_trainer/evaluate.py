@@ -92,7 +92,8 @@ def joint_errors(network, metres, samples, numbers, estimated, rule, device):
             masks = torch.stack([torch.from_numpy(estimated[int(number)])[None].float() / 255 for number in batch])
         outputs = network(overlay(images, masks, rule).to(device).contiguous(memory_format=torch.channels_last))
         truth = torch.from_numpy(samples.joints[batch])
-        errors.append(losses.joint_distances(metres(outputs).cpu(), truth).numpy())
+        arms = torch.from_numpy(samples.arms[batch]).to(device)
+        errors.append(losses.joint_distances(metres(outputs, arms).cpu(), truth).numpy())
     return np.concatenate(errors)
 
 
@@ -102,6 +103,6 @@ def score_joints(network, metres, samples, numbers, estimated, rule, device, nam
     return {f"{name}_mean_cm": round(float(each.mean()), 2), f"{name}_median_cm": round(float(np.median(each)), 2)}
 
 
-def identity_metres(outputs):
+def identity_metres(outputs, _arms):
     """The joints [N, 6, 3] of an exported joint network, whose outputs are metres."""
     return outputs.reshape(-1, len(JOINTS), 3)

@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 
 from . import __version__, data, evaluate, photos
 from .networks import CAMERA, INPUT_HEIGHT, INPUT_WIDTH, JOINT_INPUT, JOINTS, MASK_INPUT, Network
-from .train import Standardised, load_network
+from .train import load_network, output_unit
 
 DTYPES = {"f32": torch.float32, "f16": torch.float16}
 
@@ -87,12 +87,10 @@ def export_runs(args):
     joint, joint_state = load_network(args.joint)
     shift = mask_state["figures"]["logit_shift"]
     evaluate.shift_logits(mask, shift)
-    Standardised(joint_state["card"]["mean"], joint_state["card"]["deviation"]).fold(
-        getattr(joint, joint.layers[-1]["name"]))
-
     rule = joint_state["card"]["overlay"]
 
     samples = data.Samples(args.validation, args.cache)
+    output_unit(joint_state["card"]).fold(joint, float(samples.arms[0]))
     # The first part chose the checkpoints and chooses the presence threshold; the rest is what the figures are about.
     order = np.random.default_rng(args.seed).permutation(len(samples))
     chosen, reported = order[: args.validation_samples], np.sort(order[args.validation_samples :])

@@ -12,7 +12,8 @@ from tqdm import tqdm
 
 from . import data, evaluate, losses
 from .networks import (
-    JOINT_INPUT, JOINTS, MASK_INPUT, Network, context_mask_layers, overlay, paper_joint_layers, paper_mask_layers)
+    JOINT_INPUT, JOINTS, MASK_INPUT, Network, context_mask_layers, heatmap_joint_layers, overlay, paper_joint_layers,
+    paper_mask_layers)
 
 
 # --- the loop --------------------------------------------------------------------------------------------------------
@@ -146,7 +147,7 @@ def load_samples(args):
         protocol = "validated on recordings of their own"
     else:
         held_out = samples
-        numbers, validation = data.split(samples, args.seed)
+        numbers, validation = data.split(samples)
         protocol = "80/20 random split"
     if len(validation) > args.validation_samples:
         validation = np.random.default_rng(args.seed).permutation(validation)[: args.validation_samples]
@@ -195,14 +196,13 @@ def train_mask(args):
         card |= {"negatives": len(negatives), "negative_share": args.negative_share}
 
     def batch_loss(batch, _progress):
-        images, masks = samples.pixels(batch)
+        images, masks = samples.bytes(batch)
         if negatives is not None:
             rows = torch.rand(len(batch), device="cpu") < args.negative_share
             drawn = torch.randint(len(negatives), (int(rows.sum()),), device="cpu")
-            images[rows], masks[rows] = negatives[drawn].float() / 255, 0.0
-        images, masks = images.to(args.device), masks.to(args.device)
+            images[rows.numpy()], masks[rows] = negatives[drawn.numpy()], 0.0
+        images, masks = data.jitter_colours(images).to(args.device), masks.to(args.device)
         images, masks = data.random_views(images, masks, height, width, zoom=args.zoom)
-        images = data.jitter_colours(images)
         estimate = network(images.contiguous(memory_format=torch.channels_last))
         return losses.mask_loss(estimate, masks, w_fg, w_bg)
 
@@ -228,14 +228,72 @@ class Standardised:
         flat = joints.reshape(len(joints), -1)
         return cls(flat.mean(0), flat.std(0).clip(min=1e-3))
 
-    def metres(self, outputs):
-        return (outputs.float() * self.deviation + self.mean).reshape(-1, len(JOINTS), 3)
+    def metres(self, outputs, _arms):
+        outputs = outputs.float().flatten(1)
+        return (outputs * self.deviation.to(outputs.device) + self.mean.to(outputs.device)).reshape(-1, len(JOINTS), 3)
 
-    def fold(self, dense):
+    def fold(self, network, _arm):
         """Changes the last layer in place so that its outputs are metres."""
         with torch.no_grad():
-            dense.weight *= self.deviation[:, None]
-            dense.bias.copy_(dense.bias * self.deviation + self.mean)
+            network.dense.weight *= self.deviation[:, None]
+            network.dense.bias.copy_(network.dense.bias * self.deviation + self.mean)
+
+    def card(self):
+        return {"mean": self.mean.tolist(), "deviation": self.deviation.tolist()}
+
+
+class ArmLengths:
+    """Joints [N, 6, 3] in metres and outputs in arm lengths, for networks that end in slopes and logarithms of depth:
+    the unit in which one network can learn from robots of several sizes, and a new robot starts from another's.
+
+    Export folds the arm's length into the last dense layer, exactly: it is a summand of the logarithm.
+    """
+
+    def metres(self, outputs, arms):
+        return outputs.float().reshape(-1, len(JOINTS), 3) * arms[:, None, None]
+
+    def fold(self, network, arm):
+        with torch.no_grad():
+            network.dense2.bias[2::3] += math.log(arm)
+
+    def card(self):
+        return {}
+
+
+def output_unit(card):
+    return Standardised(card["mean"], card["deviation"]) if "mean" in card else ArmLengths()
+
+
+def _prepare_heatmaps(network, joints):
+    """Sets the untrained network to a plain guess: everywhere alike, at the mean depth, and no correction."""
+    with torch.no_grad():
+        for name in ("heat", "votes", "dense2"):
+            getattr(network, name).weight.mul_(0.1)
+            getattr(network, name).bias.zero_()
+        network.votes.bias[2::3] = float(np.log(joints[..., 2]).mean())
+        outputs = network.dense2.out_features
+        network.dense2.weight[:, :outputs] = torch.eye(outputs)
+
+
+def heat_loss(heat, place, truth):
+    """How far the heat maps [N, J, h, w] are from the cells where the joints are: the cross-entropy with a bump of one
+    cell's width, over the joints [N, J, 3] that are in the image.
+
+    Without it the expectation alone would have to tell the heat maps where to look.
+    """
+    count, joints, height, width = heat.shape
+    device = heat.device
+    x = place["origin"][0] + place["step"][0] * torch.arange(width, device=device)
+    y = place["origin"][1] + place["step"][1] * torch.arange(height, device=device)
+    slope_x, slope_y = (truth[..., axis] / truth[..., 2] for axis in (0, 1))
+    bump_x = torch.exp(-0.5 * ((x - slope_x[..., None]) / place["step"][0]) ** 2)
+    bump_y = torch.exp(-0.5 * ((y - slope_y[..., None]) / place["step"][1]) ** 2)
+    target = (bump_y[..., :, None] * bump_x[..., None, :]).flatten(2)
+    mass = target.sum(2, keepdim=True)
+    inside = (mass > 1)[..., 0]
+    logs = torch.log_softmax(heat.float().flatten(2), 2)
+    entropies = -(target / mass.clamp(min=1) * logs).sum(2)
+    return (entropies * inside).sum() / inside.sum().clamp(min=1)
 
 
 def train_joint(args):
@@ -243,15 +301,18 @@ def train_joint(args):
     numbers, validation = (
         chosen[part.has_robot[chosen] & (part.coverage[chosen] >= args.min_coverage)]
         for part, chosen in ((samples, numbers), (held_out, validation)))
-    standard = Standardised.of(samples.joints[numbers])
-    standard.mean, standard.deviation = standard.mean.to(args.device), standard.deviation.to(args.device)
+    joints, arms = torch.from_numpy(samples.joints), torch.from_numpy(samples.arms)
     rule = {"rule": "threshold", "threshold": 0.5} if args.overlay == "threshold" else {"rule": "multiply"}
-    card |= {"samples": len(numbers), "overlay": rule, "min_coverage": args.min_coverage,
-             "estimated_masks": args.estimated_masks, "estimated_after": args.estimated_after,
-             "mean": standard.mean.tolist(), "deviation": standard.deviation.tolist()}
-    network = initialise(Network(paper_joint_layers(args.dilations, args.pool), JOINT_INPUT, normalise=args.normalise))
+    if args.family == "context":
+        unit, layers = ArmLengths(), heatmap_joint_layers()
+    else:
+        unit, layers = Standardised.of(samples.joints[numbers]), paper_joint_layers(args.dilations, args.pool)
+    card |= {"family": args.family, "samples": len(numbers), "overlay": rule, "min_coverage": args.min_coverage,
+             "estimated_masks": args.estimated_masks, "estimated_after": args.estimated_after, **unit.card()}
+    network = initialise(Network(layers, JOINT_INPUT, normalise=args.normalise))
+    if args.family == "context":
+        _prepare_heatmaps(network, samples.joints[numbers] / samples.arms[numbers, None, None])
     network = network.to(args.device, memory_format=torch.channels_last)
-    joints = torch.from_numpy(samples.joints)
 
     estimated = held_out_estimated = None
     if args.mask_run:
@@ -265,23 +326,30 @@ def train_joint(args):
         raise SystemExit("--estimated-masks needs --mask-run")
 
     def batch_loss(batch, progress):
-        images, masks = samples.pixels(batch)
+        images, masks = samples.bytes(batch)
         if estimated is not None and progress >= args.estimated_after:
             for row in torch.nonzero(torch.rand(len(batch), device="cpu") < args.estimated_masks).flatten():
                 masks[row, 0] = torch.from_numpy(estimated[int(batch[row])]).float() / 255
-        images, masks = images.to(args.device), masks.to(args.device)
-        overlays = data.erase_rectangles(overlay(data.jitter_colours(images), masks, rule))
+        images, masks = data.jitter_colours(images).to(args.device), masks.to(args.device)
+        overlays = data.erase_rectangles(overlay(images, masks, rule))
         overlays, truth = data.rotate_camera(
             overlays, joints[batch].to(args.device), data.random_rotations(len(batch)))
-        outputs = network(overlays.contiguous(memory_format=torch.channels_last))
-        return losses.joint_loss(standard.metres(outputs), truth)
+        values = network.activations(overlays.contiguous(memory_format=torch.channels_last))
+        size = arms[batch].to(args.device)
+        # In arm lengths, so that a large robot does not count for more than a small one.
+        estimate = unit.metres(values[network.layers[-1]["name"]], size)
+        loss = losses.joint_loss(estimate / size[:, None, None], truth / size[:, None, None])
+        if args.family == "context":
+            place = next(layer for layer in network.layers if layer["op"] == "soft_argmax2d")
+            loss = loss + args.heat_weight * heat_loss(values["heat"], place, truth)
+        return loss
 
     def score():
         figures = {}
         for name, masks in (("true_mask", None), ("estimated_mask", held_out_estimated)):
             if name == "true_mask" or masks is not None:
                 figures |= evaluate.score_joints(
-                    network, standard.metres, held_out, validation, masks, rule, args.device, name)
+                    network, unit.metres, held_out, validation, masks, rule, args.device, name)
         return figures
 
     def better(figures):
