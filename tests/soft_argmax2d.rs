@@ -74,7 +74,7 @@ fn check_answer(network: &Network, values: &[f32], expected: &[f32], tolerance: 
 }
 
 proptest! {
-    #![proptest_config(cases(32))]
+    #![proptest_config(cases(16))]
 
     #[test]
     fn the_kernel_agrees_with_the_reference(
