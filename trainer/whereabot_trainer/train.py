@@ -238,8 +238,8 @@ def train_mask(args):
         if negatives is not None:
             rows = torch.rand(len(batch), device="cpu") < args.negative_share
             drawn = torch.randint(len(negatives), (int(rows.sum()),), device="cpu")
-            images[rows.numpy()], masks[rows] = negatives[drawn.numpy()], 0.0
-        images, masks = data.jitter_colours(images).to(args.device), masks.to(args.device)
+            images[rows], masks[rows] = torch.from_numpy(negatives[drawn.numpy()]), 0.0
+        images, masks = data.jitter_colours(images.to(args.device)), masks.to(args.device)
         return data.random_views(images, masks, height, width, zoom=args.zoom)
 
     def batch_loss(images, masks):
@@ -393,7 +393,7 @@ def train_joint(args):
         if estimated is not None and progress >= args.estimated_after:
             for row in torch.nonzero(torch.rand(len(batch), device="cpu") < args.estimated_masks).flatten():
                 masks[row, 0] = torch.from_numpy(estimated[int(batch[row])]).float() / 255
-        images, masks = data.jitter_colours(images).to(args.device), masks.to(args.device)
+        images, masks = data.jitter_colours(images.to(args.device)), masks.to(args.device)
         overlays = data.erase_rectangles(overlay(images, masks, rule))
         overlays, truth = data.rotate_camera(
             overlays, joints[batch].to(args.device), data.random_rotations(len(batch)))
