@@ -99,10 +99,10 @@ def test_views_keep_image_and_mask_together():
 
 def test_colours_vary_about_the_image():
     torch.manual_seed(0)
-    image = np.random.default_rng(0).integers(0, 256, (1, 32, 40, 3), np.uint8)
-    varied = data.jitter_colours(image.repeat(64, 0))
+    image = torch.randint(0, 256, (1, 32, 40, 3), dtype=torch.uint8)
+    varied = data.jitter_colours(image.repeat(64, 1, 1, 1))
     assert varied.shape == (64, 3, 32, 40) and varied.min() >= 0 and varied.max() <= 1
-    plain = torch.from_numpy(image[0]).permute(2, 0, 1) / 255
+    plain = image[0].permute(2, 0, 1) / 255
     assert (varied.mean(0) - plain).abs().mean() < 0.06
     assert (varied - plain).abs().mean((1, 2, 3)).min() > 0.005
     # Colours stay where they were.

@@ -165,17 +165,17 @@ class Samples:
     def pixels(self, numbers):
         """(images [N, 3, H, W] in [0, 1], masks [N, 1, H, W] of 0 and 1) as f32 tensors."""
         images, masks = self.bytes(numbers)
-        return torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255, masks
+        return images.permute(0, 3, 1, 2).float() / 255, masks
 
     def bytes(self, numbers):
-        """(images uint8 [N, H, W, 3] as an array, masks [N, 1, H, W] of 0 and 1 as an f32 tensor)."""
+        """(images uint8 [N, H, W, 3], masks f32 [N, 1, H, W] of 0 and 1)."""
         images = np.empty((len(numbers), INPUT_HEIGHT, INPUT_WIDTH, 3), np.uint8)
         masks = np.empty((len(numbers), INPUT_HEIGHT, INPUT_WIDTH), np.uint8)
         for row, number in enumerate(numbers):
             part = np.searchsorted(self._starts, number, "right") - 1
             images[row] = self.parts[part][0][number - self._starts[part]]
             masks[row] = self.parts[part][1][number - self._starts[part]]
-        return images, torch.from_numpy(masks)[:, None].float()
+        return torch.from_numpy(images), torch.from_numpy(masks)[:, None].float()
 
 
 def read_negatives(folders, cache):
@@ -228,39 +228,36 @@ def _uniform(count, low, high, *shape):
     return torch.empty(count, *shape).uniform_(low, high)
 
 
-NOISE = np.random.default_rng(0).uniform(-1, 1, 1 << 22).astype(np.float32)
-
-
 def jitter_colours(images):
     """Other light and another camera: gain, white balance, gamma, saturation, contrast, blur and noise.
 
     From uint8 [N, H, W, 3] to f32 [N, 3, H, W] in [0, 1], in memory as before: the format that convolutions like best.
     """
+    # On a CPU, one image at a time stays in the cache through all of these passes.
+    parts = images.split(1 if images.device.type == "cpu" else len(images))
+    return torch.cat([_jitter_colours(part) for part in parts]).permute(0, 3, 1, 2)
+
+
+def _jitter_colours(images):
     count, height, width, _ = images.shape
-    gain = _uniform(count, 0.75, 1.25, 1) * _uniform(count, 0.93, 1.07, 3)
-    levels = torch.linspace(0, 1, 256).expand(count, 3, 256) * gain[:, :, None]
-    tables = levels.clamp(max=1).pow(torch.exp(_uniform(count, -0.25, 0.25, 1, 1))).cpu().numpy().reshape(count, -1)
-    saturation, contrast = _uniform(count, 0.6, 1.4, 1, 1).cpu(), _uniform(count, 0.8, 1.2, 1).cpu()
-    mixing = contrast[:, :, None] * (saturation * torch.eye(3, device="cpu") + (1 - saturation) / 3)
-    blurred, noisy = (torch.rand(2, count, device="cpu") < torch.tensor([[0.25], [0.5]], device="cpu")).tolist()
-    result = torch.empty(count, height * width, 3, device="cpu")
-    # One image at a time stays in a CPU's cache through all of these passes.
-    for row, (image, table) in enumerate(zip(images, tables, strict=True)):
-        pixels = torch.from_numpy(table.take(image + np.array([0, 256, 512], np.int16))).reshape(-1, 3)
-        level = (1 - contrast[row]) * pixels[::7].mean()
-        pixels = torch.addmm(level.expand(3), pixels, mixing[row].T)
-        if blurred[row]:
-            planes = pixels.reshape(1, height, width, 3).permute(0, 3, 1, 2)
-            soft = torch.nn.functional.avg_pool2d(planes, 3, 1, 1, count_include_pad=False)
-            # Between sharpened (-0.5) and blurred (1).
-            amount = float(torch.empty((), device="cpu").uniform_(-0.5, 1))
-            pixels = torch.lerp(planes, soft, amount).permute(0, 2, 3, 1).reshape(-1, 3)
-        if noisy[row]:
-            start = int(torch.randint(len(NOISE) - pixels.numel(), (), device="cpu"))
-            noise = torch.from_numpy(NOISE[start : start + pixels.numel()]).reshape(pixels.shape)
-            pixels = pixels.add_(noise, alpha=float(torch.empty((), device="cpu").uniform_(0, 0.08)))
-        torch.clamp(pixels, 0, 1, out=result[row])
-    return result.reshape(count, height, width, 3).permute(0, 3, 1, 2)
+    images = images.reshape(count, -1, 3) * (
+        _uniform(count, 0.75 / 255, 1.25 / 255, 1, 1) * _uniform(count, 0.93, 1.07, 1, 3))
+    images = images.clamp_(1e-3, 1).pow_(torch.exp(_uniform(count, -0.25, 0.25, 1, 1)))
+    contrast, saturation = _uniform(count, 0.8, 1.2, 1, 1), _uniform(count, 0.6, 1.4, 1, 1)
+    mixing = contrast * (saturation * torch.eye(3) + (1 - saturation) / 3)
+    images = torch.baddbmm((1 - contrast) * images[:, ::7].mean((1, 2), keepdim=True), images, mixing)
+    blurred = torch.rand(count) < 0.25
+    if blurred.any():
+        planes = images[blurred].reshape(-1, height, width, 3).permute(0, 3, 1, 2)
+        soft = torch.nn.functional.avg_pool2d(planes, 3, 1, 1, count_include_pad=False)
+        # Between sharpened (-0.5) and blurred (1).
+        planes = torch.lerp(planes, soft, _uniform(len(planes), -0.5, 1, 1, 1, 1))
+        images[blurred] = planes.permute(0, 2, 3, 1).reshape(len(planes), -1, 3)
+    noisy = torch.rand(count) < 0.5
+    if noisy.any():
+        noise = torch.empty_like(images[noisy]).uniform_(-1, 1)
+        images[noisy] += noise * _uniform(len(noise), 0, 0.08, 1, 1)
+    return images.clamp_(0, 1).reshape(count, height, width, 3)
 
 
 def random_views(images, masks, height, width, tilt_degrees=10, zoom=(0.7, 1.6)):

@@ -71,15 +71,17 @@ def figures_by_threshold(robot, background):
     }
 
 
-def score_mask(network, samples, numbers, device):
-    """Figures at the threshold 0.5, and the shift of the logit that gives the best IoU there."""
+def calibrate(network, samples, numbers, device):
+    """The shift of the logit that gives the best IoU at the threshold 0.5."""
     curves = figures_by_threshold(*mask_histograms(network, samples, numbers, device))
-    half = int(np.argmin(np.abs(LOGIT_EDGES[:-1])))
-    best = int(curves["iou"].argmax())
-    figures = {name: round(float(curve[half]), 4) for name, curve in curves.items()}
-    return figures | {"calibrated_iou": round(float(curves["iou"][best]), 4),
-                      "calibrated_accuracy": round(float(curves["accuracy"][best]), 4),
-                      "logit_shift": round(float(-LOGIT_EDGES[best]), 3)}
+    return round(float(-LOGIT_EDGES[int(curves["iou"].argmax())]), 3)
+
+
+def score_mask(network, samples, numbers, device, shift=0.0):
+    """Figures at the threshold 0.5, the logits being shifted."""
+    curves = figures_by_threshold(*mask_histograms(network, samples, numbers, device))
+    half = int(np.argmin(np.abs(LOGIT_EDGES[:-1] + shift)))
+    return {name: round(float(curve[half]), 4) for name, curve in curves.items()}
 
 
 @torch.no_grad()

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_file
 
-from .export import describe, read_model, write_model
+from .model import describe, read_model, write_model
 from .networks import JOINT_INPUT, JOINTS, MASK_INPUT, Network, overlay
 
 WIDTH, HEIGHT = 20, 14

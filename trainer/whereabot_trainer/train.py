@@ -11,6 +11,7 @@ import torch
 from tqdm import tqdm
 
 from . import data, evaluate, losses
+from .model import read_model
 from .networks import (
     JOINT_INPUT, JOINTS, MASK_INPUT, Network, context_mask_layers, heatmap_joint_layers, overlay, paper_joint_layers,
     paper_mask_layers)
@@ -65,11 +66,11 @@ class Order:
         return self.numbers[taken]
 
 
-def fit(args, network, numbers, batch_loss, score, better, card):
+def fit(args, network, numbers, draw, batch_loss, score, card):
     """Trains `network` in the folder args.out.
 
-    `batch_loss(numbers, progress)` is the loss of a batch, `score()` the validation figures as a dict, of which
-    `better(figures)` is to be largest in best.pt. `card` goes into the checkpoints.
+    `draw(numbers, progress)` gives a batch's inputs and truth, `batch_loss(inputs, truth)` its loss, `score()` the
+    validation figures as a dict. `card` goes into the checkpoint. Rates decay to nearly nothing, so the last state is the one to use, and validation chooses nothing.
     """
     out = Path(args.out)
     out.mkdir(parents=True, exist_ok=True)
@@ -77,22 +78,16 @@ def fit(args, network, numbers, batch_loss, score, better, card):
     optimizer = make_optimizer(args.optimizer, network.parameters(), args.weight_decay)
     schedule = Schedule(args.learning_rate, args.momentum)
     order = Order(numbers, args.batch)
-    iteration, before, best = 0, 0.0, -math.inf
+    iteration, before = 0, 0.0
     last = out / "last.pt"
     if args.resume:
         state = torch.load(last, weights_only=False)
         network.load_state_dict(state["network"])
         optimizer.load_state_dict(state["optimizer"])
-        order.state, iteration, before, best = state["order"], state["iteration"], state["seconds"], state["best"]
+        order.state, iteration, before = state["order"], state["iteration"], state["seconds"]
         torch.set_rng_state(state["rng"])
     elif last.exists():
         raise SystemExit(f"{out} holds a run already: add --resume to go on with it, or choose another folder")
-
-    def save(path, **more):
-        partial = path.with_suffix(".partial")
-        torch.save({"layers": network.layers, "normalise": network.normalise, "network": network.state_dict(),
-                    "card": card, "iteration": iteration, "seconds": seconds, **more}, partial)
-        partial.replace(path)
 
     started, seconds, total, counted = time.monotonic(), before, 0.0, 0
     budget = args.iterations or 60 * args.minutes
@@ -101,8 +96,9 @@ def fit(args, network, numbers, batch_loss, score, better, card):
         while progress < 1:
             network.train()
             rate = schedule.apply(optimizer, progress)
+            inputs, truth = draw(next(order), progress)
             with torch.autocast(args.device, torch.bfloat16, enabled=args.precision == "bf16"):
-                loss = batch_loss(next(order), progress)
+                loss = batch_loss(inputs.contiguous(memory_format=torch.channels_last), truth)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             torch.nn.utils.clip_grad_norm_(network.parameters(), args.clip_gradient)
@@ -117,10 +113,12 @@ def fit(args, network, numbers, batch_loss, score, better, card):
                            "learning_rate": f"{rate:.3g}", "train_loss": round(total / counted, 5), **score()}
                 total, counted = 0.0, 0
                 _append_csv(out / "log.csv", figures)
-                if better(figures) > best:
-                    best = better(figures)
-                    save(out / "best.pt", figures=figures)
-                save(last, optimizer=optimizer.state_dict(), order=order.state, best=best, rng=torch.get_rng_state())
+                partial = last.with_suffix(".partial")
+                torch.save({"layers": network.layers, "normalise": network.normalise, "network": network.state_dict(),
+                            "card": card, "iteration": iteration, "seconds": seconds, "figures": figures,
+                            "optimizer": optimizer.state_dict(), "order": order.state, "rng": torch.get_rng_state()},
+                           partial)
+                partial.replace(last)
                 bar.set_postfix({key: figures[key] for key in list(figures)[4:]})
                 seconds = before + time.monotonic() - started
                 progress = max(progress, (iteration if args.iterations else seconds) / budget)
@@ -148,7 +146,9 @@ def load_samples(args):
     else:
         held_out = samples
         numbers, validation = data.split(samples)
-        protocol = "80/20 random split"
+        protocol = "80/20 split"
+    if args.samples and args.samples < len(numbers):
+        numbers = np.sort(np.random.default_rng(args.seed).permutation(numbers)[: args.samples])
     if len(validation) > args.validation_samples:
         validation = np.random.default_rng(args.seed).permutation(validation)[: args.validation_samples]
     card = {
@@ -170,12 +170,47 @@ def initialise(network):
     return network
 
 
-def load_network(run, name="best.pt"):
+def load_network(run):
     """(network in eval mode, without normalisation, checkpoint) of a run; its first layer tells the input's name."""
-    state = torch.load(Path(run) / name, weights_only=False, map_location="cpu")
+    state = torch.load(Path(run) / "last.pt", weights_only=False, map_location="cpu")
     network = Network(state["layers"], state["layers"][0]["inputs"][0], normalise=state["normalise"])
     network.load_state_dict(state["network"])
     return network.eval().fold_normalisation(), state
+
+
+@torch.no_grad()
+def start_from(network, tensors, images):
+    """Gives the untrained `network` another one's weights, whose normalisation is folded away, in place.
+
+    With normalisation, each layer's is set to undo itself on `images`: training goes on from the very same function.
+    """
+    own = network.state_dict()
+    for key, tensor in tensors.items():
+        if key not in own or own[key].shape != tensor.shape:
+            found = tuple(own[key].shape) if key in own else "none"
+            raise SystemExit(f"--init-from: {key}: expected {found}, found {tuple(tensor.shape)}: another family?")
+    network.load_state_dict(tensors, strict=False)
+
+    def undo(norm, inputs):
+        norm.running_mean.copy_(inputs[0].mean((0, 2, 3)))
+        norm.running_var.copy_(inputs[0].var((0, 2, 3)))
+        norm.weight.copy_(torch.sqrt(norm.running_var + norm.eps))
+        norm.bias.copy_(norm.running_mean)
+
+    hooks = [module.register_forward_pre_hook(undo) for module in network.modules()
+             if isinstance(module, torch.nn.BatchNorm2d)]
+    network.eval()(images)
+    for hook in hooks:
+        hook.remove()
+
+
+def starting_tensors(path, part):
+    """(the state dict of the `part`, mask or joint, card) of a run's folder or of a model file."""
+    if Path(path).is_dir():
+        network, state = load_network(path)
+        return network.state_dict(), state["card"]
+    mask, joint, description = read_model(path)
+    return {"mask": mask, "joint": joint}[part].state_dict(), description["card"]
 
 
 # --- the mask network ------------------------------------------------------------------------------------------------
@@ -189,27 +224,35 @@ def train_mask(args):
              "crop": args.crop, "zoom": args.zoom}
     layers = context_mask_layers() if args.family == "context" else paper_mask_layers(args.dilations)
     network = initialise(Network(layers, MASK_INPUT, normalise=args.normalise))
+    if args.init_from:
+        start_from(network, starting_tensors(args.init_from, "mask")[0], samples.pixels(numbers[:: len(numbers) // 64 + 1])[0])
+        card |= {"init_from": Path(args.init_from).name}
     network = network.to(args.device, memory_format=torch.channels_last)
 
     negatives = data.read_negatives(args.negatives, args.cache) if args.negatives else None
     if negatives is not None:
         card |= {"negatives": len(negatives), "negative_share": args.negative_share}
 
-    def batch_loss(batch, _progress):
+    def draw(batch, _progress):
         images, masks = samples.bytes(batch)
         if negatives is not None:
             rows = torch.rand(len(batch), device="cpu") < args.negative_share
             drawn = torch.randint(len(negatives), (int(rows.sum()),), device="cpu")
-            images[rows.numpy()], masks[rows] = negatives[drawn.numpy()], 0.0
-        images, masks = data.jitter_colours(images).to(args.device), masks.to(args.device)
-        images, masks = data.random_views(images, masks, height, width, zoom=args.zoom)
-        estimate = network(images.contiguous(memory_format=torch.channels_last))
-        return losses.mask_loss(estimate, masks, w_fg, w_bg)
+            images[rows], masks[rows] = torch.from_numpy(negatives[drawn.numpy()]), 0.0
+        images, masks = data.jitter_colours(images.to(args.device)), masks.to(args.device)
+        return data.random_views(images, masks, height, width, zoom=args.zoom)
+
+    def batch_loss(images, masks):
+        return losses.mask_loss(network(images), masks, w_fg, w_bg)
+
+    # What is reported on is not calibrated on: with a random split, the training samples are.
+    calibration = (held_out, validation) if args.validation else (samples, numbers[: args.validation_samples])
 
     def score():
-        return evaluate.score_mask(network, held_out, validation, args.device)
+        shift = evaluate.calibrate(network, *calibration, args.device)
+        return evaluate.score_mask(network, held_out, validation, args.device, shift) | {"logit_shift": shift}
 
-    fit(args, network, numbers, batch_loss, score, lambda figures: figures["calibrated_iou"], card)
+    fit(args, network, numbers, draw, batch_loss, score, card)
 
 
 # --- the joint network -----------------------------------------------------------------------------------------------
@@ -238,6 +281,15 @@ class Standardised:
             network.dense.weight *= self.deviation[:, None]
             network.dense.bias.copy_(network.dense.bias * self.deviation + self.mean)
 
+    def unfold(self, tensors, origin):
+        """Brings another network's tensors into this unit, in place; `origin` is its card."""
+        if "mean" in origin:
+            mean, deviation = (torch.as_tensor(origin[key]) for key in ("mean", "deviation"))
+            tensors["dense.weight"] = tensors["dense.weight"] * deviation[:, None]
+            tensors["dense.bias"] = tensors["dense.bias"] * deviation + mean
+        tensors["dense.weight"] = tensors["dense.weight"] / self.deviation[:, None]
+        tensors["dense.bias"] = (tensors["dense.bias"] - self.mean) / self.deviation
+
     def card(self):
         return {"mean": self.mean.tolist(), "deviation": self.deviation.tolist()}
 
@@ -255,6 +307,11 @@ class ArmLengths:
     def fold(self, network, arm):
         with torch.no_grad():
             network.dense2.bias[2::3] += math.log(arm)
+
+    def unfold(self, tensors, origin):
+        # A run's network is in arm lengths already; a model file's is in metres and says how long its arm is.
+        tensors["dense2.bias"] = tensors["dense2.bias"].clone()
+        tensors["dense2.bias"][2::3] -= math.log(origin.get("arm_length_m", 1.0))
 
     def card(self):
         return {}
@@ -308,10 +365,16 @@ def train_joint(args):
     else:
         unit, layers = Standardised.of(samples.joints[numbers]), paper_joint_layers(args.dilations, args.pool)
     card |= {"family": args.family, "samples": len(numbers), "overlay": rule, "min_coverage": args.min_coverage,
-             "estimated_masks": args.estimated_masks, "estimated_after": args.estimated_after, **unit.card()}
+             "heat_weight": args.heat_weight, "estimated_masks": args.estimated_masks, "estimated_after": args.estimated_after, **unit.card()}
     network = initialise(Network(layers, JOINT_INPUT, normalise=args.normalise))
     if args.family == "context":
         _prepare_heatmaps(network, samples.joints[numbers] / samples.arms[numbers, None, None])
+    if args.init_from:
+        tensors, origin = starting_tensors(args.init_from, "joint")
+        unit.unfold(tensors, origin)
+        images, masks = samples.pixels(numbers[:: len(numbers) // 64 + 1])
+        start_from(network, tensors, overlay(images, masks, rule))
+        card |= {"init_from": Path(args.init_from).name}
     network = network.to(args.device, memory_format=torch.channels_last)
 
     estimated = held_out_estimated = None
@@ -325,17 +388,20 @@ def train_joint(args):
     elif args.estimated_masks > 0:
         raise SystemExit("--estimated-masks needs --mask-run")
 
-    def batch_loss(batch, progress):
+    def draw(batch, progress):
         images, masks = samples.bytes(batch)
         if estimated is not None and progress >= args.estimated_after:
             for row in torch.nonzero(torch.rand(len(batch), device="cpu") < args.estimated_masks).flatten():
                 masks[row, 0] = torch.from_numpy(estimated[int(batch[row])]).float() / 255
-        images, masks = data.jitter_colours(images).to(args.device), masks.to(args.device)
+        images, masks = data.jitter_colours(images.to(args.device)), masks.to(args.device)
         overlays = data.erase_rectangles(overlay(images, masks, rule))
         overlays, truth = data.rotate_camera(
             overlays, joints[batch].to(args.device), data.random_rotations(len(batch)))
-        values = network.activations(overlays.contiguous(memory_format=torch.channels_last))
-        size = arms[batch].to(args.device)
+        return overlays, (truth, arms[batch].to(args.device))
+
+    def batch_loss(overlays, joints_and_arms):
+        truth, size = joints_and_arms
+        values = network.activations(overlays)
         # In arm lengths, so that a large robot does not count for more than a small one.
         estimate = unit.metres(values[network.layers[-1]["name"]], size)
         loss = losses.joint_loss(estimate / size[:, None, None], truth / size[:, None, None])
@@ -352,7 +418,4 @@ def train_joint(args):
                     network, unit.metres, held_out, validation, masks, rule, args.device, name)
         return figures
 
-    def better(figures):
-        return -figures["true_mask_mean_cm"] - figures.get("estimated_mask_mean_cm", 0)
-
-    fit(args, network, numbers, batch_loss, score, better, card)
+    fit(args, network, numbers, draw, batch_loss, score, card)
