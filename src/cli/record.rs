@@ -20,6 +20,10 @@ pub struct Args {
     /// Where package://NAME/ is; by default searched upwards from the URDF
     #[arg(long, value_name = "NAME=DIR", value_parser = package)]
     package: Vec<(String, PathBuf)>,
+    /// Another body of the same robot: where its joints' points are (JSON) and its URDF; repeatable.
+    /// With a free camera the robot has one of these bodies as often as its own
+    #[arg(long, value_name = "FRAMES=URDF", value_parser = body)]
+    body: Vec<(PathBuf, PathBuf)>,
     /// The robot's name, which the recording carries
     #[arg(long, value_name = "NAME")]
     robot: String,
@@ -50,11 +54,19 @@ fn package(text: &str) -> Result<(String, PathBuf), String> {
     }
 }
 
+fn body(text: &str) -> Result<(PathBuf, PathBuf), String> {
+    match text.split_once('=') {
+        Some((frames, urdf)) => Ok((frames.into(), urdf.into())),
+        None => Err("expected FRAMES=URDF".to_owned()),
+    }
+}
+
 /// Runs the command.
 pub fn run(args: Args) -> anyhow::Result<ExitCode> {
     let request = Request {
         urdf: args.urdf,
         packages: args.package,
+        bodies: args.body,
         robot: args.robot,
         backgrounds: args.backgrounds,
         samples: args.samples,

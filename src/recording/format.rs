@@ -47,6 +47,9 @@ pub struct Source {
     pub seed: u64,
     /// The robot description's file name.
     pub urdf: String,
+    /// The file names of the other bodies' descriptions.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub bodies: Vec<String>,
     /// How camera and robot move.
     pub protocol: Protocol,
 }
