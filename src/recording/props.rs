@@ -254,8 +254,18 @@ impl Support {
                     let width = rng.random_range(0.16..0.35);
                     let tall = if rng.random_bool(0.5) { 0.012 } else { 0.001 };
                     let size = DVec3::new(width, width, tall);
-                    let mesh = if rng.random_bool(0.5) { CUBOID } else { CYLINDER };
-                    build.add(mesh, place(0.0, 0.0, 0.5 * tall), size, other, Kind::Scenery);
+                    let mesh = if rng.random_bool(0.5) {
+                        CUBOID
+                    } else {
+                        CYLINDER
+                    };
+                    build.add(
+                        mesh,
+                        place(0.0, 0.0, 0.5 * tall),
+                        size,
+                        other,
+                        Kind::Scenery,
+                    );
                 }
                 for (x, y) in [(0.45, 0.45), (0.45, -0.45), (-0.45, 0.45), (-0.45, -0.45)] {
                     let leg = DVec3::new(0.06, 0.06, size.z);
@@ -293,7 +303,8 @@ pub(super) fn line_distance(line: &[DVec3], point: DVec3) -> f64 {
     line.windows(2)
         .map(|ends| {
             let along = ends[1] - ends[0];
-            let t = ((point - ends[0]).dot(along) / along.length_squared().max(1e-9)).clamp(0.0, 1.0);
+            let t =
+                ((point - ends[0]).dot(along) / along.length_squared().max(1e-9)).clamp(0.0, 1.0);
             point.distance(ends[0] + t * along)
         })
         .fold(f64::INFINITY, f64::min)
@@ -362,7 +373,11 @@ impl Builder {
         let width = rng.random_range(0.15..0.35);
         let size = DVec3::new(width, width, base.z - bottom);
         let at = DAffine3::from_translation(base - DVec3::Z * 0.5 * size.z);
-        let mesh = if rng.random_bool(0.5) { CUBOID } else { CYLINDER };
+        let mesh = if rng.random_bool(0.5) {
+            CUBOID
+        } else {
+            CYLINDER
+        };
         let material = furniture(rng);
         self.add(mesh, at, size, material, Kind::Scenery);
     }
@@ -438,9 +453,8 @@ impl Builder {
         for n in 0..fingers {
             let turn = DQuat::from_rotation_z(TAU * f64::from(n) / f64::from(fingers));
             let place = tool * DAffine3::from_quat(turn);
-            let finger_at = |x: f64, z: f64| {
-                place.transform_point3(DVec3::new(x, 0.0, adapter + body + z))
-            };
+            let finger_at =
+                |x: f64, z: f64| place.transform_point3(DVec3::new(x, 0.0, adapter + body + z));
             // A knuckle that leans outwards, then the finger itself.
             let half = 0.5 * gap;
             let knuckle = rng.random_range(0.2..0.6) * finger;
@@ -448,11 +462,7 @@ impl Builder {
             self.rod(low, high, 0.5 * thick, second, Kind::Scenery);
             let size = DVec3::new(thick, 0.025, finger);
             let pose = place
-                * DAffine3::from_translation(DVec3::new(
-                    half,
-                    0.0,
-                    adapter + body + 0.5 * finger,
-                ));
+                * DAffine3::from_translation(DVec3::new(half, 0.0, adapter + body + 0.5 * finger));
             self.add(CUBOID, pose, size, third, Kind::Scenery);
         }
         if rng.random_bool(0.35) {
@@ -530,13 +540,21 @@ impl Builder {
                     };
                     knots.push(around(angle, near, t));
                     let half = angle + 0.5 * winding;
-                    let hanging = around(half, near + slack * rng.random_range(0.0..1.0), t + 0.5 / straps as f64);
+                    let hanging = around(
+                        half,
+                        near + slack * rng.random_range(0.0..1.0),
+                        t + 0.5 / straps as f64,
+                    );
                     knots.push(hanging - DVec3::Z * 0.4 * slack);
                     angle += winding + 0.3 * normal(rng);
                     if rng.random_bool(0.25) {
                         let middle = ends[0].lerp(ends[1], t);
                         let half = way * rng.random_range(0.006..0.02);
-                        let strap = if rng.random_bool(0.5) { plain(albedo) } else { plain(any_colour(rng)) };
+                        let strap = if rng.random_bool(0.5) {
+                            plain(albedo)
+                        } else {
+                            plain(any_colour(rng))
+                        };
                         self.rod(middle - half, middle + half, 0.9 * near, strap, Kind::Cable);
                     }
                 }
@@ -576,7 +594,11 @@ impl Builder {
                 let narrow = rng.random_bool(0.7);
                 let size = DVec3::new(
                     rng.random_range(0.5..4.0),
-                    if narrow { 0.06 } else { rng.random_range(0.4..1.5) },
+                    if narrow {
+                        0.06
+                    } else {
+                        rng.random_range(0.4..1.5)
+                    },
                     0.002,
                 );
                 let (x, y) = (rng.random_range(-2.0..2.0), rng.random_range(-2.0..2.0));
@@ -592,7 +614,11 @@ impl Builder {
         if rng.random_bool(0.6) {
             let screen = rng.random_bool(0.05).then(|| {
                 let hue = rng.random_range(0.24..0.36);
-                plain(hsv(hue, rng.random_range(0.6..0.95), rng.random_range(0.4..0.95)))
+                plain(hsv(
+                    hue,
+                    rng.random_range(0.6..0.95),
+                    rng.random_range(0.4..0.95),
+                ))
             });
             let of_wall = screen.unwrap_or_else(|| paint(rng));
             let distance = rng.random_range(0.7..4.0);
@@ -602,7 +628,13 @@ impl Builder {
                 DAffine3::from_rotation_translation(turn, turn * DVec3::new(x, y, bottom + z))
             };
             let size = DVec3::new(0.1, 12.0, tall);
-            self.add(CUBOID, wall(distance + 0.05, 0.0, 0.5 * tall), size, of_wall, Kind::Surface);
+            self.add(
+                CUBOID,
+                wall(distance + 0.05, 0.0, 0.5 * tall),
+                size,
+                of_wall,
+                Kind::Surface,
+            );
             if rng.random_bool(0.4) {
                 let side = if rng.random_bool(0.5) { 1.0 } else { -1.0 };
                 let at = wall(0.0, side * rng.random_range(0.9..2.5), 0.5 * tall);
@@ -656,7 +688,10 @@ impl Builder {
             let deep = rng.random_range(0.01..0.05);
             let (material, size) = match rng.random_range(0..6) {
                 // Bright: a window or a whiteboard.
-                0 => (plain(grey(rng, 0.9, 1.0).map(|c| 1.4 * c)), DVec3::new(deep, wide, high)),
+                0 => (
+                    plain(grey(rng, 0.9, 1.0).map(|c| 1.4 * c)),
+                    DVec3::new(deep, wide, high),
+                ),
                 1 => {
                     let poster = Material {
                         photo: 1.0,
@@ -709,7 +744,13 @@ impl Builder {
             let frame = DVec3::new(0.03, wide, 0.62 * wide);
             self.add(CUBOID, at(0.0, y, z), frame, dark, Kind::Scenery);
             let stand = DVec3::new(0.03, 0.06, z - size.z);
-            self.add(CUBOID, at(0.02, y, 0.5 * (z + size.z)), stand, dark, Kind::Scenery);
+            self.add(
+                CUBOID,
+                at(0.02, y, 0.5 * (z + size.z)),
+                stand,
+                dark,
+                Kind::Scenery,
+            );
             let glow = Material {
                 albedo: grey(rng, 0.02, 0.9),
                 photo: if rng.random_bool(0.6) { 0.9 } else { 0.0 },
@@ -742,7 +783,9 @@ impl Builder {
     fn post(&mut self, foot: DVec3, rng: &mut ChaCha8Rng) {
         let tall = rng.random_range(0.6..2.2);
         let radius = rng.random_range(0.01..0.06);
-        if !self.clear(foot + DVec3::Z * tall, 0.3) || !self.clear(foot + DVec3::Z * 0.5 * tall, 0.3) {
+        if !self.clear(foot + DVec3::Z * tall, 0.3)
+            || !self.clear(foot + DVec3::Z * 0.5 * tall, 0.3)
+        {
             return;
         }
         let material = self.bright(rng);
@@ -763,7 +806,13 @@ impl Builder {
         );
         let mesh = *[CUBOID, CYLINDER, SPHERE].choose(rng).unwrap_or(&CUBOID);
         let material = any_material(rng);
-        self.add(mesh, DAffine3::from_translation(top), head, material, Kind::Scenery);
+        self.add(
+            mesh,
+            DAffine3::from_translation(top),
+            head,
+            material,
+            Kind::Scenery,
+        );
     }
 
     /// A finish like those of the robot's parts.
@@ -795,7 +844,13 @@ impl Builder {
         let (bar, board) = (aluminium(rng), furniture(rng));
         for (x, y) in [(0.5, 0.5), (0.5, -0.5), (-0.5, 0.5), (-0.5, -0.5)] {
             let size = DVec3::new(0.04, 0.04, tall);
-            self.add(CUBOID, at(x * deep, y * wide, 0.5 * tall), size, bar, Kind::Scenery);
+            self.add(
+                CUBOID,
+                at(x * deep, y * wide, 0.5 * tall),
+                size,
+                bar,
+                Kind::Scenery,
+            );
         }
         let levels = rng.random_range(2..=4);
         for n in 0..levels {
@@ -803,7 +858,11 @@ impl Builder {
             let size = DVec3::new(deep, wide, 0.025);
             self.add(CUBOID, at(0.0, 0.0, z), size, board, Kind::Scenery);
             for _ in 0..rng.random_range(0..=3) {
-                let size = DVec3::new(0.7 * deep, rng.random_range(0.06..0.3), rng.random_range(0.06..0.25));
+                let size = DVec3::new(
+                    0.7 * deep,
+                    rng.random_range(0.06..0.3),
+                    rng.random_range(0.06..0.25),
+                );
                 let y = 0.4 * wide * rng.random_range(-1.0..1.0);
                 let material = any_material(rng);
                 let pose = at(0.0, y, z + 0.5 * size.z);
@@ -830,11 +889,21 @@ impl Builder {
                 rng.random_range(0.3..0.5),
                 rng.random_range(0.5..0.8),
             ));
-            self.add(CUBOID, at(0.0, 0.0, 0.5 * size.z), size, board, Kind::Scenery);
+            self.add(
+                CUBOID,
+                at(0.0, 0.0, 0.5 * size.z),
+                size,
+                board,
+                Kind::Scenery,
+            );
             return;
         }
         let colour = if rng.random_bool(0.6) {
-            hsv(rng.random_range(0.58..0.66), 0.8, rng.random_range(0.4..0.8))
+            hsv(
+                rng.random_range(0.58..0.66),
+                0.8,
+                rng.random_range(0.4..0.8),
+            )
         } else {
             any_colour(rng)
         };
@@ -845,13 +914,31 @@ impl Builder {
         };
         let thin = 0.012;
         let bottom = DVec3::new(size.x, size.y, thin);
-        self.add(CUBOID, at(0.0, 0.0, 0.5 * thin), bottom, plastic, Kind::Scenery);
+        self.add(
+            CUBOID,
+            at(0.0, 0.0, 0.5 * thin),
+            bottom,
+            plastic,
+            Kind::Scenery,
+        );
         for side in [-0.5, 0.5] {
             let long = DVec3::new(size.x, thin, size.z);
             let short = DVec3::new(thin, size.y, size.z);
             let z = 0.5 * size.z;
-            self.add(CUBOID, at(0.0, side * size.y, z), long, plastic, Kind::Scenery);
-            self.add(CUBOID, at(side * size.x, 0.0, z), short, plastic, Kind::Scenery);
+            self.add(
+                CUBOID,
+                at(0.0, side * size.y, z),
+                long,
+                plastic,
+                Kind::Scenery,
+            );
+            self.add(
+                CUBOID,
+                at(side * size.x, 0.0, z),
+                short,
+                plastic,
+                Kind::Scenery,
+            );
         }
     }
 
@@ -871,7 +958,13 @@ impl Builder {
                 let x = (f64::from(column) - 0.5 * f64::from(columns - 1)) * square;
                 let y = (f64::from(row) - 0.5 * f64::from(rows - 1)) * square;
                 let pose = place * DAffine3::from_translation(DVec3::new(x, y, 0.06 * square));
-                self.add(CUBOID, pose, DVec3::new(square, square, 0.02), black, Kind::Surface);
+                self.add(
+                    CUBOID,
+                    pose,
+                    DVec3::new(square, square, 0.02),
+                    black,
+                    Kind::Surface,
+                );
             }
         }
     }
@@ -979,7 +1072,11 @@ impl Builder {
             ..MATT
         };
         let one = paint(rng);
-        let two = if rng.random_bool(0.5) { one } else { paint(rng) };
+        let two = if rng.random_bool(0.5) {
+            one
+        } else {
+            paint(rng)
+        };
         let ball = rng.random_bool(0.5);
         let mut radius = rng.random_range(0.04..0.1);
         for _ in 0..rng.random_range(3..=6) {
@@ -1034,7 +1131,8 @@ impl Builder {
 
     /// A person `tall` metres tall who looks along x.
     fn person(&mut self, foot: DVec3, turn: DQuat, tall: f64, rng: &mut ChaCha8Rng) {
-        let place = DAffine3::from_rotation_translation(turn, foot) * DAffine3::from_scale(DVec3::splat(tall));
+        let place = DAffine3::from_rotation_translation(turn, foot)
+            * DAffine3::from_scale(DVec3::splat(tall));
         let at = |x: f64, y: f64, z: f64| place.transform_point3(DVec3::new(x, y, z));
         let pose = |x: f64, y: f64, z: f64| DAffine3::from_rotation_translation(turn, at(x, y, z));
         let (skin, shirt, trousers) = (skin(rng), clothing(rng), clothing(rng));
@@ -1054,17 +1152,31 @@ impl Builder {
             self.rod(hip, knee, 0.05 * tall, trousers, Kind::Scenery);
             self.rod(knee, ankle, 0.036 * tall, trousers, Kind::Scenery);
             let shoe = DVec3::new(0.15, 0.055, 0.05) * tall;
-            self.add(CUBOID, pose(stride + 0.03, side * 0.06, 0.025), shoe, trousers, Kind::Scenery);
+            self.add(
+                CUBOID,
+                pose(stride + 0.03, side * 0.06, 0.025),
+                shoe,
+                trousers,
+                Kind::Scenery,
+            );
             // Arms hang, or reach forwards.
             let reaching = rng.random_bool(0.4);
-            let lift = if reaching { rng.random_range(0.4..1.5) } else { 0.15 };
+            let lift = if reaching {
+                rng.random_range(0.4..1.5)
+            } else {
+                0.15
+            };
             let shoulder = (0.0, side * 0.5 * wide, 0.8);
             let elbow = (
                 0.17 * f64::sin(lift),
                 shoulder.1 + side * 0.03,
                 0.8 - 0.17 * f64::cos(lift),
             );
-            let bend = if reaching { lift + rng.random_range(0.0..0.9) } else { lift + 0.2 };
+            let bend = if reaching {
+                lift + rng.random_range(0.0..0.9)
+            } else {
+                lift + 0.2
+            };
             let hand = (
                 elbow.0 + 0.16 * f64::sin(bend),
                 elbow.1 - side * rng.random_range(0.0..0.1),
@@ -1073,10 +1185,22 @@ impl Builder {
             let [a, b, c] = [shoulder, elbow, hand].map(|(x, y, z)| at(x, y, z));
             let bare = rng.random_bool(0.4);
             self.rod(a, b, 0.032 * tall, shirt, Kind::Scenery);
-            self.rod(b, c, 0.024 * tall, if bare { skin } else { shirt }, Kind::Scenery);
+            self.rod(
+                b,
+                c,
+                0.024 * tall,
+                if bare { skin } else { shirt },
+                Kind::Scenery,
+            );
             for (place, size, material) in [(a, 0.075, shirt), (b, 0.058, shirt), (c, 0.06, skin)] {
                 let ball = DAffine3::from_translation(place);
-                self.add(SPHERE, ball, DVec3::splat(size * tall), material, Kind::Scenery);
+                self.add(
+                    SPHERE,
+                    ball,
+                    DVec3::splat(size * tall),
+                    material,
+                    Kind::Scenery,
+                );
             }
         }
         let chest = DVec3::new(0.14, wide, 0.3) * tall;
@@ -1085,7 +1209,13 @@ impl Builder {
         self.add(SPHERE, pose(0.0, 0.0, 0.52), belly, trousers, Kind::Scenery);
         let top = DVec3::new(0.14, wide, 0.1) * tall;
         self.add(SPHERE, pose(0.0, 0.0, 0.81), top, shirt, Kind::Scenery);
-        self.rod(at(0.0, 0.0, 0.82), at(0.01, 0.0, 0.88), 0.03 * tall, skin, Kind::Scenery);
+        self.rod(
+            at(0.0, 0.0, 0.82),
+            at(0.01, 0.0, 0.88),
+            0.03 * tall,
+            skin,
+            Kind::Scenery,
+        );
         let head = DVec3::new(0.105, 0.088, 0.13) * tall;
         self.add(SPHERE, pose(0.012, 0.0, 0.925), head, skin, Kind::Scenery);
         let crown = DVec3::new(0.108, 0.096, 0.11) * tall;
@@ -1118,9 +1248,21 @@ impl Builder {
                 let (sleeve, skin) = (clothing(rng), skin(rng));
                 let hand = DAffine3::from_translation(centre);
                 if self.clear(centre, 0.08) && self.clear(centre + 0.3 * way, 0.15) {
-                    self.rod(centre + 0.06 * way, centre + 0.6 * way, 0.05, sleeve, Kind::Scenery);
+                    self.rod(
+                        centre + 0.06 * way,
+                        centre + 0.6 * way,
+                        0.05,
+                        sleeve,
+                        Kind::Scenery,
+                    );
                     self.rod(centre, centre + 0.1 * way, 0.032, skin, Kind::Scenery);
-                    self.add(SPHERE, hand, DVec3::new(0.1, 0.08, 0.09), skin, Kind::Scenery);
+                    self.add(
+                        SPHERE,
+                        hand,
+                        DVec3::new(0.1, 0.08, 0.09),
+                        skin,
+                        Kind::Scenery,
+                    );
                 }
             } else if self.clear(centre, 0.5 * size.length()) {
                 let pose = DAffine3::from_rotation_translation(turn, centre);

@@ -103,7 +103,11 @@ impl Robot {
         let mut text = std::fs::read_to_string(urdf).map_err(RecordingError::io(urdf))?;
         // Drake's attributes mostly come without the declaration that XML wants.
         if text.contains(" drake:") && !text.contains("xmlns:drake") {
-            text = text.replacen("<robot ", "<robot xmlns:drake=\"https://drake.mit.edu\" ", 1);
+            text = text.replacen(
+                "<robot ",
+                "<robot xmlns:drake=\"https://drake.mit.edu\" ",
+                1,
+            );
         }
         let fail = |message: String| RecordingError::Urdf {
             path: urdf.to_owned(),
@@ -261,8 +265,8 @@ impl Robot {
             .ok_or_else(|| format!("expected a link \"{link}\", found none"))?;
         for (name, &offset) in &frames.offsets_m {
             let joint = self.joints.iter_mut().find(|j| j.name == *name);
-            let joint = joint
-                .ok_or_else(|| format!("expected a moving joint \"{name}\", found none"))?;
+            let joint =
+                joint.ok_or_else(|| format!("expected a moving joint \"{name}\", found none"))?;
             joint.offset = offset;
         }
         Ok(())

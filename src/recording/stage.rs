@@ -13,7 +13,7 @@ use super::chance::{direction, grey, hsv, normal};
 use super::collision::CollisionModel;
 use super::effects::{Effects, Window};
 use super::mesh::Mesh;
-use super::props::{Builder, MATT, PRIMITIVES, Support, line_distance, lighting};
+use super::props::{Builder, MATT, PRIMITIVES, Support, lighting, line_distance};
 use super::robot::{Frames, Robot};
 use super::scene::{Item, Kind, Material, Scene};
 use super::{HEIGHT, INTRINSICS, RecordingError, WIDTH};
@@ -104,10 +104,7 @@ pub struct Station {
 }
 
 impl Body {
-    fn load(
-        mut robot: Robot,
-        meshes: &mut Vec<Mesh>,
-    ) -> Body {
+    fn load(mut robot: Robot, meshes: &mut Vec<Mesh>) -> Body {
         let collision = CollisionModel::new(&robot);
         let mut visual = Vec::new();
         let mut shadow = Vec::new();
@@ -267,7 +264,9 @@ impl Stage {
     /// The robot as it is described, or one of its other bodies as often.
     fn any_body(&self, rng: &mut ChaCha8Rng) -> &Body {
         let other = self.others.choose(rng);
-        other.filter(|_| rng.random_bool(0.55)).unwrap_or(&self.main)
+        other
+            .filter(|_| rng.random_bool(0.55))
+            .unwrap_or(&self.main)
     }
 
     /// Sample `id` of a recording with a free camera: the same for the same `seed` and `id`.
@@ -327,7 +326,15 @@ impl Stage {
             let camera = station.camera_from_base;
             if arm.in_view(camera, &Window::WHOLE) >= Some(4.min(arm.joints())) {
                 let window = Window::WHOLE;
-                return Ok(self.dress(camera, window, support, &[arm], &mut look, &mut rng, photos));
+                return Ok(self.dress(
+                    camera,
+                    window,
+                    support,
+                    &[arm],
+                    &mut look,
+                    &mut rng,
+                    photos,
+                ));
             }
         }
         Err(RecordingError::NoScene { id })
