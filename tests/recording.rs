@@ -612,10 +612,8 @@ fn pictures_of_other_shapes_have_black_edges_without_a_mask() {
         whole += usize::from(window == Window::WHOLE);
         tall += usize::from(left > 0.0);
         flat += usize::from(top > 0.0);
-        assert_eq!(
-            (left + right, top.max(424.0 - bottom) < 90.0),
-            (512.0, true)
-        );
+        // In the middle, but for the pixel that an odd size leaves over.
+        assert!((left + right - 512.0).abs() <= 1.0 && (top + bottom - 424.0).abs() <= 1.0);
         let pixels = picture.rgb.as_chunks::<3>().0.iter();
         for (i, (pixel, &mask)) in (0..).zip(pixels.zip(&picture.mask)) {
             let inside = window.contains([i % WIDTH, i / WIDTH]);
