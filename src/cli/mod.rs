@@ -5,6 +5,7 @@ mod info;
 mod locate;
 mod photo;
 mod record;
+mod recording;
 mod weights;
 
 use std::io::{self, Write};
@@ -21,6 +22,8 @@ enum Command {
     Adapters(adapters::Args),
     Info(info::Args),
     Record(record::Args),
+    #[command(subcommand)]
+    Recording(recording::Args),
 }
 
 /// Runs the command line of this process. Exit codes: 0 done, 1 failed, 2 wrong usage.
@@ -37,6 +40,7 @@ pub fn main() -> ExitCode {
         Command::Adapters(args) => adapters::run(&args),
         Command::Info(args) => info::run(&args),
         Command::Record(args) => record::run(args),
+        Command::Recording(args) => recording::run(&args),
     };
     done.unwrap_or_else(|error| {
         if is_broken_pipe(&error) {

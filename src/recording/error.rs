@@ -64,6 +64,30 @@ pub enum RecordingError {
         /// What the decoder said.
         cause: image::ImageError,
     },
+    /// A recording's header is not what the format asks for.
+    #[error("{}: {message}", path.display())]
+    Header {
+        /// The recording's `recording.json`.
+        path: PathBuf,
+        /// What was expected and what was found.
+        message: String,
+    },
+    /// A sample, or one of its pictures, is not what the format asks for.
+    #[error("{}:{line}: {message}", path.display())]
+    Line {
+        /// The recording's `samples.jsonl`.
+        path: PathBuf,
+        /// The line, from 1.
+        line: u64,
+        /// What was expected and what was found.
+        message: String,
+    },
+    /// A recording without samples.
+    #[error("{}: expected at least one sample, found none", path.display())]
+    NoSamples {
+        /// The recording's `samples.jsonl`.
+        path: PathBuf,
+    },
     /// The output folder already holds something that this request does not continue.
     #[error("{}: {message}", path.display())]
     OutputTaken {
@@ -77,6 +101,16 @@ pub enum RecordingError {
     NoScene {
         /// The sample's number.
         id: u64,
+    },
+    /// A sweep of the joints has too few poses that a fixed camera can see.
+    #[error(
+        "expected {wanted} poses without collision and with all joints in the picture, found {found}"
+    )]
+    TooFewPoses {
+        /// How many samples were asked for.
+        wanted: usize,
+        /// How many poses there are.
+        found: usize,
     },
     /// The GPU could not draw.
     #[error(transparent)]

@@ -11,10 +11,12 @@ mod error;
 mod format;
 mod mesh;
 mod props;
+mod reader;
 mod render;
 mod robot;
 mod scene;
 mod stage;
+mod sweep;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -25,8 +27,9 @@ pub use background::{Backgrounds, PhotoView};
 pub use collision::CollisionModel;
 pub use effects::{Effects, Window};
 pub use error::RecordingError;
-pub use format::{Header, Protocol, Sample, Source, Writer, write_picture};
+pub use format::{Header, Protocol, Sample, Source, SourceKind, Writer, write_picture};
 pub use mesh::Mesh;
+pub use reader::Reader;
 pub use render::{Picture, Renderer};
 pub use robot::{Frames, Joint, Link, Robot};
 pub use scene::{Item, Kind, Lamp, Lighting, Material, Scene};
@@ -62,12 +65,51 @@ pub struct Request {
     pub backgrounds: PathBuf,
     /// How many samples.
     pub samples: u64,
-    /// Samples are drawn from this seed and their number alone.
+    /// Samples are drawn from this seed and their number alone; with a fixed camera, also from
+    /// `samples`.
     pub seed: u64,
     /// How camera and robot move.
     pub protocol: Protocol,
     /// The recording's folder.
     pub out: PathBuf,
+}
+
+/// The paper's nine recordings: each robot's numbers of samples (the paper, table 1).
+pub const PAPER: [(&str, [u64; 3]); 3] = [
+    ("ur3", [211, 252, 463]),
+    ("ur5", [252, 756, 1512]),
+    ("ur10", [112, 278, 514]),
+];
+
+/// Requests for the paper's nine recordings, in the folders `ur3_1` to `ur10_3` of `out`, each with its
+/// own camera and look. `urdfs`: the descriptions of UR3, UR5 and UR10.
+pub fn paper_requests(
+    urdfs: [PathBuf; 3],
+    packages: &[(String, PathBuf)],
+    backgrounds: &Path,
+    seed: u64,
+    out: &Path,
+) -> Vec<Request> {
+    let recordings = PAPER.iter().zip(urdfs).flat_map(|((robot, counts), urdf)| {
+        let numbered = counts.iter().zip(1..);
+        numbered.map(move |(&samples, number)| (*robot, number, samples, urdf.clone()))
+    });
+    // No two of these are alike for any two seeds.
+    let seeds = (0..).map(|n| seed.wrapping_mul(9).wrapping_add(n));
+    recordings
+        .zip(seeds)
+        .map(|((robot, number, samples, urdf), seed)| Request {
+            urdf,
+            packages: packages.to_vec(),
+            bodies: Vec::new(),
+            robot: robot.to_owned(),
+            backgrounds: backgrounds.to_owned(),
+            samples,
+            seed,
+            protocol: Protocol::FixedCamera,
+            out: out.join(format!("{robot}_{number}")),
+        })
+        .collect()
 }
 
 /// Renders a recording; goes on with one that was cut off. `progress` hears how many samples are done.
@@ -83,8 +125,8 @@ pub fn record(
     let backgrounds = Backgrounds::open(&request.backgrounds)?;
     let stage = Stage::load(&request.urdf, &request.packages, &request.bodies)?;
     let header = Header {
-        format: "whereabot-recording".into(),
-        version: 1,
+        format: format::FORMAT.into(),
+        version: format::VERSION,
         robot: request.robot.clone(),
         joints: stage
             .robot()
@@ -94,18 +136,29 @@ pub fn record(
             .collect(),
         width: WIDTH,
         height: HEIGHT,
-        frame: "camera_optical".into(),
+        frame: format::FRAME.into(),
         source: Source {
-            kind: "synthetic".into(),
+            kind: SourceKind::Synthetic,
             generator: concat!("whereabot ", env!("CARGO_PKG_VERSION")).into(),
-            seed: request.seed,
-            urdf: file_name(&request.urdf),
+            seed: Some(request.seed),
+            urdf: Some(file_name(&request.urdf)),
             bodies: request.bodies.iter().map(|(_, b)| file_name(b)).collect(),
-            protocol: request.protocol,
+            protocol: Some(request.protocol),
+            planned: (request.protocol == Protocol::FixedCamera).then_some(request.samples),
         },
     };
+    if request.out.join("recording.json").exists() {
+        let done = Writer::open(&request.out, &header)?.next();
+        if done >= request.samples {
+            progress(done);
+            return Ok(());
+        }
+    }
     let station = match request.protocol {
-        Protocol::FixedCamera => Some(stage.station(request.seed)?),
+        Protocol::FixedCamera => {
+            let samples = usize::try_from(request.samples).unwrap_or(usize::MAX);
+            Some(stage.station(request.seed, samples)?)
+        }
         Protocol::FreeCamera => None,
     };
     let renderer = Mutex::new(Renderer::new(device, stage.meshes())?);

@@ -342,6 +342,14 @@ fn plain(albedo: [f32; 3]) -> Material {
 }
 
 impl Builder {
+    pub(super) fn new(camera_from_base: DAffine3) -> Builder {
+        Builder {
+            items: Vec::new(),
+            camera: camera_from_base.inverse().translation,
+            arms: Vec::new(),
+        }
+    }
+
     fn add(&mut self, mesh: usize, pose: DAffine3, size: DVec3, material: Material, kind: Kind) {
         let base_from_mesh = pose * DAffine3::from_scale(size);
         self.items.push(Item {
@@ -494,9 +502,10 @@ impl Builder {
         }
     }
 
-    /// Cables and hoses along an arm, wound round it or in loops beside it, and the straps that hold
-    /// them. `spine`: the arm as a line.
-    pub(super) fn cables(&mut self, spine: &[DVec3], reach: f64, rng: &mut ChaCha8Rng) {
+    /// Cables and hoses along the latest arm, wound round it or in loops beside it, and the straps that
+    /// hold them.
+    pub(super) fn cables(&mut self, reach: f64, rng: &mut ChaCha8Rng) {
+        let spine = self.arms.last().cloned().unwrap_or_default();
         let links: Vec<[DVec3; 2]> = spine
             .windows(2)
             .skip(1)

@@ -7,6 +7,7 @@ use glam::{DAffine3, DMat3, DQuat, DVec3};
 use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
 
 use super::background::PhotoView;
 use super::chance::{direction, grey, hsv, normal};
@@ -16,6 +17,7 @@ use super::mesh::Mesh;
 use super::props::{Builder, MATT, PRIMITIVES, Support, lighting, line_distance};
 use super::robot::{Frames, Robot};
 use super::scene::{Item, Kind, Material, Scene};
+use super::sweep::Sweep;
 use super::{HEIGHT, INTRINSICS, RecordingError, WIDTH};
 
 /// The robot's part in a shot.
@@ -97,10 +99,11 @@ pub struct Stage {
     others: Vec<Body>,
 }
 
-/// What stays the same over a recording with a fixed camera.
+/// A recording with a fixed camera: what stays the same, and the robot's poses.
 pub struct Station {
     camera_from_base: DAffine3,
     seed: u64,
+    poses: Vec<Vec<f64>>,
 }
 
 impl Body {
@@ -190,18 +193,18 @@ impl Body {
         angles
     }
 
-    fn free(&self, rng: &mut ChaCha8Rng) -> Option<Arm<'_>> {
-        (0..200).find_map(|_| {
-            let angles = self.angles(rng);
-            let poses = self.robot.link_poses(&angles);
-            let free = !self.collision.floor_collision(&poses, 0.0)
-                && !self.collision.self_collision(&poses);
-            free.then_some(Arm {
-                body: self,
-                angles,
-                poses,
-            })
-        })
+    fn arm(&self, angles: Vec<f64>) -> Arm<'_> {
+        Arm {
+            body: self,
+            poses: self.robot.link_poses(&angles),
+            angles,
+        }
+    }
+
+    fn any_arm(&self, rng: &mut ChaCha8Rng) -> Option<Arm<'_>> {
+        (0..200)
+            .map(|_| self.arm(self.angles(rng)))
+            .find(Arm::is_free)
     }
 }
 
@@ -286,7 +289,7 @@ impl Stage {
         }
         let body = self.any_body(&mut rng);
         for _ in 0..100 {
-            let Some(arm) = body.free(&mut rng) else {
+            let Some(arm) = body.any_arm(&mut rng) else {
                 continue;
             };
             for _ in 0..8 {
@@ -305,58 +308,105 @@ impl Stage {
         Err(RecordingError::NoScene { id })
     }
 
-    /// Sample `id` of a recording with a fixed camera.
+    /// Sample `id` of a recording with a fixed camera: the photo behind the robot and the light are the
+    /// sample's own, all else is the station's.
     ///
     /// # Errors
-    /// No pose without collision that stays in the picture was found.
+    /// The station has fewer samples.
     pub fn fixed_shot(
         &self,
         station: &Station,
         id: u64,
         photos: usize,
     ) -> Result<Shot, RecordingError> {
+        let pose = usize::try_from(id).ok().and_then(|i| station.poses.get(i));
+        let Some(angles) = pose else {
+            return Err(RecordingError::NoScene { id });
+        };
+        let arm = self.main.arm(angles.clone());
+        let camera_from_base = station.camera_from_base;
         let mut rng = ChaCha8Rng::seed_from_u64(station.seed);
         rng.set_stream(id);
         let mut look = station_rng(station.seed);
         let support = Support::any(&mut look);
-        for _ in 0..200 {
-            let Some(arm) = self.main.free(&mut rng) else {
-                continue;
-            };
-            let camera = station.camera_from_base;
-            if arm.in_view(camera, &Window::WHOLE) >= Some(4.min(arm.joints())) {
-                let window = Window::WHOLE;
-                return Ok(self.dress(
-                    camera,
-                    window,
-                    support,
-                    &[arm],
-                    &mut look,
-                    &mut rng,
-                    photos,
-                ));
-            }
-        }
-        Err(RecordingError::NoScene { id })
+        let mut build = Builder::new(camera_from_base);
+        support.build(&mut build, &mut look);
+        let centre = put_arm(&mut build, &arm, &support, &mut look);
+        let texture = PhotoView::any(&mut look, photos, false);
+        let textured = build.items.iter().any(|item| item.material.photo > 0.0);
+        Ok(Shot {
+            scene: Scene {
+                camera_from_base,
+                items: build.items,
+                lighting: lighting(&mut rng),
+                centre,
+            },
+            background: PhotoView::any(&mut rng, photos, true),
+            texture: textured.then_some(texture),
+            effects: Effects::any(&mut rng, Window::WHOLE),
+            robot: Some(arm.posed(camera_from_base)),
+        })
     }
 
-    /// Chooses the camera of a recording with a fixed camera: one that shows the robot on 6 to 17 % of
-    /// the picture in as many poses as possible (the paper, section 3).
+    /// The camera and the `samples` poses of a recording with a fixed camera (the paper, section 2): all
+    /// joints are swept through their ranges in equal steps, in combination, and poses in which the robot
+    /// meets itself or the floor, or has a joint outside the picture, are left out. The more samples,
+    /// the finer the steps.
+    ///
+    /// The camera is one that shows the robot whole and on 6 to 17 % of the picture (the paper, section 3)
+    /// in as many poses as possible.
     ///
     /// # Errors
-    /// The robot has no pose without collision.
-    pub fn station(&self, seed: u64) -> Result<Station, RecordingError> {
-        const POSES: usize = 40;
+    /// There are not as many such poses.
+    pub fn station(&self, seed: u64, samples: usize) -> Result<Station, RecordingError> {
+        let camera_from_base = self.station_camera(seed);
+        let kept = |sweep: &Sweep| -> Vec<Vec<f64>> {
+            let keep = |point: usize| {
+                let arm = self.main.arm(sweep.angles(point));
+                let seen = arm.in_view(camera_from_base, &Window::WHOLE) >= Some(arm.joints());
+                (seen && arm.is_free()).then_some(arm.angles)
+            };
+            (0..sweep.len()).into_par_iter().filter_map(keep).collect()
+        };
+        // So many points at most for each sample: more would say that hardly any pose can be seen.
+        const POINTS: usize = 400;
+        let mut sweep = Sweep::new(&self.main.robot, samples);
+        let mut poses = kept(&sweep);
+        while poses.len() < samples {
+            if sweep.len() > POINTS * samples {
+                return Err(RecordingError::TooFewPoses {
+                    wanted: samples,
+                    found: poses.len(),
+                });
+            }
+            let share = (poses.len() as f64 / sweep.len() as f64).max(0.01);
+            let wanted = (samples as f64 / share) as usize;
+            sweep = Sweep::new(&self.main.robot, wanted.max(sweep.len() + 1));
+            poses = kept(&sweep);
+        }
+        log::debug!("{} of {} poses of the sweep kept", poses.len(), sweep.len());
+        let evenly = |i: usize| poses.get(i * poses.len() / samples).cloned();
+        Ok(Station {
+            camera_from_base,
+            seed,
+            poses: (0..samples).filter_map(evenly).collect(),
+        })
+    }
+
+    fn station_camera(&self, seed: u64) -> DAffine3 {
+        const CAMERAS: usize = 100;
+        const POSES: usize = 60;
         let mut rng = station_rng(seed);
         let support = Support::any(&mut rng.clone());
-        let poses: Vec<Arm> = (0..POSES)
-            .filter_map(|_| self.main.free(&mut rng))
+        let sweep = Sweep::new(&self.main.robot, 10 * POSES);
+        let poses: Vec<Arm> = (0..sweep.len())
+            .step_by(sweep.len().div_ceil(5 * POSES))
+            .map(|point| self.main.arm(sweep.angles(point)))
+            .filter(Arm::is_free)
+            .take(POSES)
             .collect();
-        if poses.is_empty() {
-            return Err(RecordingError::NoScene { id: 0 });
-        }
         let mut best = (-1.0, DAffine3::IDENTITY);
-        for _ in 0..60 {
+        for _ in 0..CAMERAS {
             let direction = direction(
                 &mut rng,
                 support.lowest_camera().max(5f64.to_radians()),
@@ -366,21 +416,21 @@ impl Stage {
             let aim = DVec3::new(0.0, 0.0, self.main.reach * rng.random_range(0.2..0.6));
             let pixel = [INTRINSICS.cx, INTRINSICS.cy + rng.random_range(-20.0..20.0)];
             let camera = look_at(aim, direction, distance, 0.0, pixel);
-            let mut score = 0.0;
-            for pose in &poses {
-                let coverage = self.coverage(camera, pose, &Window::WHOLE);
-                score += f64::from((0.06..0.17).contains(&coverage));
-                let seen = pose.in_view(camera, &Window::WHOLE);
-                score += f64::from(seen >= Some(pose.joints()));
-            }
+            // What is seen at another size counts against the camera.
+            let whole = &Window::WHOLE;
+            let score: f64 = poses
+                .par_iter()
+                .filter(|arm| arm.in_view(camera, whole) >= Some(arm.joints()))
+                .map(|arm| match self.coverage(camera, arm, whole) {
+                    share if (0.06..0.17).contains(&share) => 1.0,
+                    _ => -1.0,
+                })
+                .sum();
             if score > best.0 {
                 best = (score, camera);
             }
         }
-        Ok(Station {
-            camera_from_base: best.1,
-            seed,
-        })
+        best.1
     }
 
     /// A camera that shows the arm at a random size, if the first try keeps the rules.
@@ -439,7 +489,7 @@ impl Stage {
         let spine = first.body.robot.spine(&first.poses);
         let largest = self.coverage(camera, first, window);
         (0..12).find_map(|_| {
-            let mut arm = self.any_body(rng).free(rng)?;
+            let mut arm = self.any_body(rng).any_arm(rng)?;
             let distance = arm.body.reach * rng.random_range(0.5..1.8);
             let yaw = rng.random_range(0.0..TAU);
             let height = if rng.random_bool(0.7) {
@@ -530,11 +580,7 @@ impl Stage {
         rng: &mut ChaCha8Rng,
         photos: usize,
     ) -> Shot {
-        let mut build = Builder {
-            items: Vec::new(),
-            camera: camera_from_base.inverse().translation,
-            arms: Vec::new(),
-        };
+        let mut build = Builder::new(camera_from_base);
         let mut centre = DVec3::new(0.0, 0.0, 0.3);
         let bare = arms.is_empty() && look.random_bool(0.4);
         let floor = if bare {
@@ -543,20 +589,15 @@ impl Stage {
             support.build(&mut build, look)
         };
         for (n, arm) in arms.iter().enumerate() {
-            let spine = arm.body.robot.spine(&arm.poses);
-            if n == 0 {
-                centre = spine.iter().sum::<DVec3>() / spine.len() as f64;
-            } else if let Some(&base) = spine.first() {
-                build.plinth(base, floor, look);
+            if n > 0 {
+                build.plinth(arm.base(), floor, look);
             }
-            build.arms.push(spine.clone());
-            add_robot(&mut build, arm, look);
-            let tool = arm.body.tool.and_then(|t| arm.poses.get(t));
-            if let Some(tool) = tool {
-                build.gripper(*tool, support.is_table(), look);
+            let middle = put_arm(&mut build, arm, &support, look);
+            if n == 0 {
+                centre = middle;
             }
             if rng.random_bool(0.5) {
-                build.cables(&spine, arm.body.reach, rng);
+                build.cables(arm.body.reach, rng);
             }
         }
         build.room(floor, rng);
@@ -567,14 +608,6 @@ impl Stage {
         {
             build.occluders(&arm.joint_origins(), rng);
         }
-        let posed = arms.first().map(|arm| Posed {
-            angles: arm.angles.clone(),
-            joints: arm
-                .joint_origins()
-                .into_iter()
-                .map(|j| camera_from_base.transform_point3(j))
-                .collect(),
-        });
         let texture = PhotoView::any(rng, photos, false);
         let textured = build.items.iter().any(|item| item.material.photo > 0.0);
         Shot {
@@ -587,14 +620,35 @@ impl Stage {
             background: PhotoView::any(rng, photos, true),
             texture: textured.then_some(texture),
             effects: Effects::any(rng, window),
-            robot: posed,
+            robot: arms.first().map(|arm| arm.posed(camera_from_base)),
         }
     }
 }
 
 impl Arm<'_> {
+    /// Whether the arm meets neither itself nor the floor.
+    fn is_free(&self) -> bool {
+        let collision = &self.body.collision;
+        !collision.floor_collision(&self.poses, 0.0) && !collision.self_collision(&self.poses)
+    }
+
+    fn posed(&self, camera_from_base: DAffine3) -> Posed {
+        let joints = self.joint_origins().into_iter();
+        Posed {
+            angles: self.angles.clone(),
+            joints: joints
+                .map(|j| camera_from_base.transform_point3(j))
+                .collect(),
+        }
+    }
+
     fn joints(&self) -> usize {
         self.body.robot.joints.len()
+    }
+
+    fn base(&self) -> DVec3 {
+        let pose = self.poses.get(self.body.robot.base_link());
+        pose.copied().unwrap_or_default().translation
     }
 
     fn joint_origins(&self) -> Vec<DVec3> {
@@ -622,6 +676,18 @@ impl Arm<'_> {
 fn any_roll(rng: &mut ChaCha8Rng) -> f64 {
     let spread = if rng.random_bool(0.1) { 12.0 } else { 3.5 };
     (spread * normal(rng)).to_radians()
+}
+
+/// Puts an arm with a tool into a scene; returns its middle.
+fn put_arm(build: &mut Builder, arm: &Arm, support: &Support, look: &mut ChaCha8Rng) -> DVec3 {
+    let spine = arm.body.robot.spine(&arm.poses);
+    let middle = spine.iter().sum::<DVec3>() / spine.len() as f64;
+    build.arms.push(spine);
+    add_robot(build, arm, look);
+    if let Some(tool) = arm.body.tool.and_then(|t| arm.poses.get(t)) {
+        build.gripper(*tool, support.is_table(), look);
+    }
+    middle
 }
 
 fn add_robot(build: &mut Builder, arm: &Arm, rng: &mut ChaCha8Rng) {
