@@ -369,10 +369,14 @@ impl Builder {
         self.add(CYLINDER, pose, size, material, kind);
     }
 
-    /// Whether a ball is clear of the arms and the camera.
+    /// Whether a ball is clear of the arms and the camera, and leaves most of the first arm in view.
     fn clear(&self, centre: DVec3, radius: f64) -> bool {
         let far = |line: &Vec<DVec3>| line_distance(line, centre) > radius + 0.09;
-        self.arms.iter().all(far) && centre.distance(self.camera) > radius + 0.25
+        let first = self.arms.first().map_or(&[][..], Vec::as_slice);
+        let hides = |&&point: &&DVec3| line_distance(&[self.camera, point], centre) < radius;
+        self.arms.iter().all(far)
+            && centre.distance(self.camera) > radius + 0.25
+            && 3 * first.iter().filter(hides).count() <= first.len()
     }
 
     /// What a second arm stands on.
@@ -630,23 +634,33 @@ impl Builder {
                 ))
             });
             let of_wall = screen.unwrap_or_else(|| paint(rng));
-            let distance = rng.random_range(0.7..4.0);
             let turn = DQuat::from_rotation_z(heading + 0.5 * normal(rng));
+            // Walls are behind and beside everything.
+            let inside: Vec<DVec3> = self
+                .arms
+                .iter()
+                .flatten()
+                .map(|&p| turn.inverse() * p)
+                .collect();
+            let camera = turn.inverse() * self.camera;
+            let behind = inside.iter().map(|p| p.x).fold(camera.x, f64::max) + 0.12;
+            let distance = rng.random_range(0.7..4.0f64).max(behind);
             let tall = rng.random_range(1.8..4.0);
             let wall = |x: f64, y: f64, z: f64| {
                 DAffine3::from_rotation_translation(turn, turn * DVec3::new(x, y, bottom + z))
             };
             let size = DVec3::new(0.1, 12.0, tall);
-            self.add(
-                CUBOID,
-                wall(distance + 0.05, 0.0, 0.5 * tall),
-                size,
-                of_wall,
-                Kind::Surface,
-            );
+            let at = wall(distance + 0.05, 0.0, 0.5 * tall);
+            self.add(CUBOID, at, size, of_wall, Kind::Surface);
             if rng.random_bool(0.4) {
                 let side = if rng.random_bool(0.5) { 1.0 } else { -1.0 };
-                let at = wall(0.0, side * rng.random_range(0.9..2.5), 0.5 * tall);
+                let beside = inside
+                    .iter()
+                    .map(|p| side * p.y)
+                    .fold(side * camera.y, f64::max)
+                    + 0.2;
+                let offset = rng.random_range(0.9..2.5f64).max(beside);
+                let at = wall(0.0, side * offset, 0.5 * tall);
                 let of_side = screen.unwrap_or_else(|| paint(rng));
                 let size = DVec3::new(2.0 * distance, 0.1, tall);
                 self.add(CUBOID, at, size, of_side, Kind::Surface);

@@ -507,7 +507,8 @@ impl Stage {
                 .windows(2)
                 .flat_map(|ends| [ends[0], 0.5 * (ends[0] + ends[1])])
                 .all(|point| line_distance(&spine, point) > 0.2);
-            let seen = clear && arm.in_view(camera, window) >= Some(1);
+            let near = camera.transform_point3(arm.base()).z < 0.6;
+            let seen = clear && !near && arm.in_view(camera, window) >= Some(1);
             let share = if seen {
                 self.coverage(camera, &arm, window)
             } else {
