@@ -374,7 +374,8 @@ impl Stage {
         let mut sweep = Sweep::new(&self.main.robot, samples);
         let mut poses = kept(&sweep);
         while poses.len() < samples {
-            let share = (poses.len() as f64 / sweep.len() as f64).max(0.01);
+            // A coarse sweep may say little about how many poses a finer one has.
+            let share = (poses.len() as f64 / sweep.len() as f64).max(0.125);
             let wanted = (samples as f64 / share) as usize;
             let finer = Sweep::new(&self.main.robot, wanted.max(sweep.len() + 1));
             // A robot whose joints cannot turn has no finer sweep.
