@@ -331,8 +331,9 @@ impl Stage {
         let support = Support::any(&mut look);
         let mut build = Builder::new(camera_from_base);
         support.build(&mut build, &mut look);
-        let centre = put_arm(&mut build, &arm, &support, &mut look);
         let texture = PhotoView::any(&mut look, photos, false);
+        // Last, as poses that leave no room for a tool draw less.
+        let centre = put_arm(&mut build, &arm, &support, &mut look);
         let textured = build.items.iter().any(|item| item.material.photo > 0.0);
         Ok(Shot {
             scene: Scene {
