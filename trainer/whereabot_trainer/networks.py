@@ -55,7 +55,8 @@ def context_mask_layers():
         conv("conv9", source, 32, kernel=1),
         {"name": "up1", "op": "upsample2d", "inputs": ["conv9"], "scale": 2},
         {"name": "skip1", "op": "concat", "inputs": ["up1", "conv2"]},
-        conv("conv10", "skip1", 32),
+        # What is enlarged to the full resolution is kept thin: there, memory is what costs.
+        conv("conv10", "skip1", 16),
         {"name": "up2", "op": "upsample2d", "inputs": ["conv10"], "scale": 2},
         {"name": "skip2", "op": "concat", "inputs": ["up2", "conv1"]},
         conv("conv11", "skip2", 1, activation="sigmoid"),
