@@ -454,7 +454,7 @@ fn a_recording_tells_the_truth_about_its_pictures() {
     let header: Header = serde_json::from_str(&header).unwrap();
     assert_eq!(header.joints, ["pan", "lift", "elbow"]);
     assert_eq!((header.width, header.height, header.version), (512, 424, 1));
-    assert_eq!(header.source.urdf, "arm.urdf");
+    assert_eq!(header.source.urdf.as_deref(), Some("arm.urdf"));
 
     let robot = Robot::load(&request.urdf, &request.packages).unwrap();
     let samples = samples(&request.out);

@@ -56,6 +56,30 @@ pub enum RecordingError {
         /// What the decoder said.
         cause: image::ImageError,
     },
+    /// A recording's header is not what the format asks for.
+    #[error("{}: {message}", path.display())]
+    Header {
+        /// The recording's `recording.json`.
+        path: PathBuf,
+        /// What was expected and what was found.
+        message: String,
+    },
+    /// A sample, or one of its pictures, is not what the format asks for.
+    #[error("{}:{line}: {message}", path.display())]
+    Line {
+        /// The recording's `samples.jsonl`.
+        path: PathBuf,
+        /// The line, from 1.
+        line: u64,
+        /// What was expected and what was found.
+        message: String,
+    },
+    /// A recording without samples.
+    #[error("{}: expected at least one sample, found none", path.display())]
+    NoSamples {
+        /// The recording's `samples.jsonl`.
+        path: PathBuf,
+    },
     /// The output folder already holds something that this request does not continue.
     #[error("{}: {message}", path.display())]
     OutputTaken {

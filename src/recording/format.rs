@@ -13,6 +13,13 @@ use super::render::Picture;
 use super::{HEIGHT, RecordingError, WIDTH};
 use crate::camera::Intrinsics;
 
+/// The header's `format`.
+pub(super) const FORMAT: &str = "whereabot-recording";
+/// The header's `version`.
+pub(super) const VERSION: u32 = 1;
+/// The header's `frame`.
+pub(super) const FRAME: &str = "camera_optical";
+
 /// `recording.json`: what all samples of a recording have in common.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -39,16 +46,29 @@ pub struct Header {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Source {
-    /// `synthetic`.
-    pub kind: String,
-    /// The program and its version.
+    /// Rendered, or taken with a camera.
+    pub kind: SourceKind,
+    /// The program that wrote it, and its version.
     pub generator: String,
-    /// The seed that the samples were drawn from.
-    pub seed: u64,
-    /// The robot description's file name.
-    pub urdf: String,
-    /// How camera and robot move.
-    pub protocol: Protocol,
+    /// The seed that the samples were drawn from. Each synthetic recording has one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub seed: Option<u64>,
+    /// The robot description's file name. Each synthetic recording has one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub urdf: Option<String>,
+    /// How camera and robot move. Each synthetic recording has one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub protocol: Option<Protocol>,
+}
+
+/// Whether a recording was rendered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SourceKind {
+    /// Rendered.
+    Synthetic,
+    /// Taken with a camera, of a real robot.
+    Real,
 }
 
 /// How camera and robot move over a recording.
@@ -87,6 +107,20 @@ pub struct Sample {
     pub joints_px: Option<Vec<[f64; 2]>>,
     /// The share of pixels whose mask is 255.
     pub coverage: f64,
+}
+
+impl Sample {
+    /// Whether the sample is one of those to test with: one in five, told by its id alone, so that
+    /// a recording that grows keeps its split. The rest is to train with (the paper, section 2, splits
+    /// at random into 80 and 20 %).
+    ///
+    /// All of the format's readers split alike: the id's hash (SplitMix64) is a multiple of 5.
+    pub fn is_test(&self) -> bool {
+        let mut z = self.id.wrapping_add(1).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        (z ^ (z >> 31)).is_multiple_of(5)
+    }
 }
 
 /// Writes a recording.

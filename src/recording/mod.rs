@@ -11,6 +11,7 @@ mod error;
 mod format;
 mod mesh;
 mod props;
+mod reader;
 mod render;
 mod robot;
 mod scene;
@@ -25,8 +26,9 @@ pub use background::{Backgrounds, PhotoView};
 pub use collision::CollisionModel;
 pub use effects::Effects;
 pub use error::RecordingError;
-pub use format::{Header, Protocol, Sample, Source, Writer, write_picture};
+pub use format::{Header, Protocol, Sample, Source, SourceKind, Writer, write_picture};
 pub use mesh::Mesh;
+pub use reader::Reader;
 pub use render::{Picture, Renderer};
 pub use robot::{Joint, Link, Robot};
 pub use scene::{Item, Kind, Lamp, Lighting, Material, Scene};
@@ -81,8 +83,8 @@ pub fn record(
     let backgrounds = Backgrounds::open(&request.backgrounds)?;
     let stage = Stage::load(&request.urdf, &request.packages)?;
     let header = Header {
-        format: "whereabot-recording".into(),
-        version: 1,
+        format: format::FORMAT.into(),
+        version: format::VERSION,
         robot: request.robot.clone(),
         joints: stage
             .robot()
@@ -92,17 +94,16 @@ pub fn record(
             .collect(),
         width: WIDTH,
         height: HEIGHT,
-        frame: "camera_optical".into(),
+        frame: format::FRAME.into(),
         source: Source {
-            kind: "synthetic".into(),
+            kind: SourceKind::Synthetic,
             generator: concat!("whereabot ", env!("CARGO_PKG_VERSION")).into(),
-            seed: request.seed,
+            seed: Some(request.seed),
             urdf: request
                 .urdf
                 .file_name()
-                .map(|n| n.to_string_lossy().into_owned())
-                .unwrap_or_default(),
-            protocol: request.protocol,
+                .map(|n| n.to_string_lossy().into_owned()),
+            protocol: Some(request.protocol),
         },
     };
     let station = match request.protocol {
