@@ -1,6 +1,7 @@
 //! The command line: one file a command.
 
 mod adapters;
+mod evaluate;
 mod info;
 mod locate;
 mod photo;
@@ -21,6 +22,7 @@ enum Command {
     Adapters(adapters::Args),
     Info(info::Args),
     Record(record::Args),
+    Evaluate(evaluate::Args),
 }
 
 /// Runs the command line of this process. Exit codes: 0 done, 1 failed, 2 wrong usage.
@@ -37,6 +39,7 @@ pub fn main() -> ExitCode {
         Command::Adapters(args) => adapters::run(&args),
         Command::Info(args) => info::run(&args),
         Command::Record(args) => record::run(args),
+        Command::Evaluate(args) => evaluate::run(&args),
     };
     done.unwrap_or_else(|error| {
         if is_broken_pipe(&error) {

@@ -308,11 +308,12 @@ pub struct Scene {
 
 impl PhotoFigures {
     /// Of `scores` of one model or several.
-    pub fn new(scores: &[PhotoScore]) -> Self {
-        let found = |score: &&PhotoScore| score.status == Status::Found;
-        let iou = |score: &PhotoScore| score.mask.iou();
+    pub fn new<'a>(scores: impl IntoIterator<Item = &'a PhotoScore>) -> Self {
+        let scores: Vec<&PhotoScore> = scores.into_iter().collect();
+        let found = |score: &&&PhotoScore| score.status == Status::Found;
+        let iou = |score: &&PhotoScore| score.mask.iou();
         let mut by_scene: BTreeMap<&str, Vec<&PhotoScore>> = BTreeMap::new();
-        for score in scores {
+        for &score in &scores {
             by_scene.entry(&score.scene).or_default().push(score);
         }
         let scenes: Vec<Scene> = by_scene
@@ -320,8 +321,8 @@ impl PhotoFigures {
             .map(|(name, scores)| Scene {
                 name: name.to_owned(),
                 photos: scores.len(),
-                found: scores.iter().copied().filter(found).count(),
-                iou: Summary::of(scores.iter().copied().filter_map(iou)),
+                found: scores.iter().filter(found).count(),
+                iou: Summary::of(scores.iter().filter_map(iou)),
             })
             .collect();
         let joints = |errors: fn(&PhotoScore) -> &Vec<f64>, share: bool| {
