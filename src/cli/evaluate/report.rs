@@ -506,24 +506,20 @@ fn joint_rows(
     all: fn(&JointFigures) -> Option<Summary>,
     each: fn(&JointFigures) -> Vec<Option<Summary>>,
 ) -> Vec<Row> {
-    let mut rows = vec![
-        row([
-            "",
-            "images",
-            "true mask",
-            "",
-            "",
-            "full system",
-            "",
-            "",
-            "images",
-            "where found",
-        ]),
-        row([
-            "", "", "mean", "median", "95 %", "mean", "median", "95 %", "", "mean", "median",
-            "95 %",
-        ]),
-    ];
+    let mut rows = vec![row([
+        "",
+        "images",
+        "true mask: mean",
+        "median",
+        "95 %",
+        "full system: mean",
+        "median",
+        "95 %",
+        "where found: images",
+        "mean",
+        "median",
+        "95 %",
+    ])];
     for (name, figures) in subjects {
         let three_ways = [
             &figures.true_mask,
