@@ -30,7 +30,19 @@ def test_reads_a_recording_and_its_growth(recording, tmp_path):
         assert torch.equal(left, right)
     assert whole.has_robot.sum() == 36 and whole.coverage[9] == 0
     # What was on the validation side before stays there.
-    assert set(data.split(first, 1)[1]) == {n for n in data.split(grown, 1)[1] if n < 7}
+    assert set(data.split(first)[1]) == {n for n in data.split(grown)[1] if n < 7}
+
+
+def test_one_sample_in_five_is_for_testing():
+    assert np.flatnonzero(data.is_test(np.arange(40))).tolist() == [0, 1, 5, 7, 9, 16, 23, 26, 31, 35]
+    assert 0.19 < data.is_test(np.arange(10000)).mean() < 0.21
+
+
+def test_an_arm_is_measured_from_the_shoulder_to_the_wrist():
+    joints = np.zeros((3, 6, 3))
+    joints[:, 2, 0], joints[:, 3:, 0] = 0.5, 0.9
+    joints[2] = np.nan
+    assert data.arm_length(joints) == pytest.approx(0.9)
 
 
 @pytest.mark.parametrize(("line", "complaint"), [
@@ -85,12 +97,24 @@ def test_views_keep_image_and_mask_together():
     assert 0.1 < masks.mean() < 0.9
 
 
+def test_colours_vary_about_the_image():
+    torch.manual_seed(0)
+    image = torch.randint(0, 256, (1, 32, 40, 3), dtype=torch.uint8)
+    varied = data.jitter_colours(image.repeat(64, 1, 1, 1))
+    assert varied.shape == (64, 3, 32, 40) and varied.min() >= 0 and varied.max() <= 1
+    plain = image[0].permute(2, 0, 1) / 255
+    assert (varied.mean(0) - plain).abs().mean() < 0.06
+    assert (varied - plain).abs().mean((1, 2, 3)).min() > 0.005
+    # Colours stay where they were.
+    assert torch.corrcoef(torch.stack([varied[3].flatten(), plain.flatten()]))[0, 1] > 0.8
+
+
 def test_negatives_fill_the_input(tmp_path):
     Image.new("RGB", (90, 30), (10, 200, 30)).save(tmp_path / "wide.png")
     Image.new("L", (30, 90), 7).save(tmp_path / "tall.jpg")
     for _ in range(2):
         photographs = data.read_negatives([tmp_path], tmp_path / "cache")
-        assert photographs.shape == (2, 3, INPUT_HEIGHT, INPUT_WIDTH)
-        assert photographs[1, :, 100, 100].tolist() == [10, 200, 30]
+        assert photographs.shape == (2, INPUT_HEIGHT, INPUT_WIDTH, 3)
+        assert photographs[1, 100, 100].tolist() == [10, 200, 30]
     with pytest.raises(data.RecordingError, match="no photographs"):
         data.read_negatives([tmp_path / "cache"], tmp_path / "cache")

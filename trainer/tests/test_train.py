@@ -1,5 +1,7 @@
 import csv
 import json
+import math
+import shutil
 
 import pytest
 import torch
@@ -7,10 +9,12 @@ from safetensors.torch import load_file
 
 from whereabot_trainer import data, evaluate, golden
 from whereabot_trainer.__main__ import main
-from whereabot_trainer.export import SURE_THRESHOLDS, choose_presence, read_model
+from whereabot_trainer.export import SURE_THRESHOLDS, choose_presence
+from whereabot_trainer.model import read_model
 from whereabot_trainer.networks import (
-    JOINT_INPUT, MASK_INPUT, Network, context_mask_layers, paper_joint_layers, paper_mask_layers)
-from whereabot_trainer.train import Standardised, load_network
+    JOINT_INPUT, MASK_INPUT, Network, back_project, context_mask_layers, heatmap_joint_layers, paper_joint_layers,
+    paper_mask_layers, soft_argmax2d)
+from whereabot_trainer.train import heat_loss, load_network, output_unit, start_from
 
 
 @pytest.fixture
@@ -60,14 +64,16 @@ def test_a_run_is_not_overwritten(train):
         train("train-mask", "run", *flags)
 
 
-def test_export_folds_calibration_and_standardisation(train, recording, tmp_path):
+@pytest.mark.parametrize("family", ["paper", "context"])
+def test_export_folds_calibration_and_unit(train, recording, tmp_path, family):
     mask_run = train("train-mask", "mask", "--iterations", "3", "--crop", "32", "24", "--validation-samples", "4")
-    joint_run = train("train-joint", "joint", "--iterations", "3", "--pool", "4", "--validation-samples", "4",
+    joint_run = train("train-joint", "joint", "--family", family, "--iterations", "3", "--pool", "4", "--validation-samples", "4",
                       "--mask-run", str(mask_run), "--estimated-masks", "0.5")
     path = tmp_path / "model.safetensors"
     main(["export", "--mask", str(mask_run), "--joint", str(joint_run), "--validation", str(recording),
-          "--cache", str(tmp_path / "cache"), "--out", str(path)])
+          "--validation-samples", "10", "--cache", str(tmp_path / "cache"), "--out", str(path)])
     mask, joint, description = read_model(path)
+    assert [len(description["card"]["curves"][name]) for name in ("mask_accuracy", "estimated_mask_cm")] == [1, 1]
     assert description["card"]["figures"]["estimated_mask_mean_cm"] > 0
 
     trained_mask, mask_state = load_network(mask_run)
@@ -76,7 +82,8 @@ def test_export_folds_calibration_and_standardisation(train, recording, tmp_path
     shift = mask_state["figures"]["logit_shift"]
     assert torch.allclose(mask(images), torch.sigmoid(torch.logit(trained_mask(images)) + shift), atol=1e-5)
     assert not torch.allclose(mask(images), trained_mask(images), atol=1e-2)
-    metres = Standardised(joint_state["card"]["mean"], joint_state["card"]["deviation"]).metres(trained_joint(images))
+    arms = torch.full((2,), float(data.Samples([recording], tmp_path / "cache").arms[0]))
+    metres = output_unit(joint_state["card"]).metres(trained_joint(images), arms)
     assert torch.allclose(joint(images).reshape(-1, 6, 3), metres, atol=1e-4)
     assert not torch.allclose(joint(images), trained_joint(images), atol=1e-2)
 
@@ -108,9 +115,10 @@ def test_calibration_finds_the_best_threshold():
             image[..., 0, 0] = 1.0
             return image.expand(-1, 3, -1, -1), mask
 
-    figures = evaluate.score_mask(Fixed(), Made(), [0, 1], "cpu")
-    assert figures["iou"] == 0.5 and figures["calibrated_iou"] == pytest.approx(0.98, abs=1e-3)
-    assert -3.001 <= figures["logit_shift"] < -1.9
+    assert evaluate.score_mask(Fixed(), Made(), [0, 1], "cpu")["iou"] == 0.5
+    shift = evaluate.calibrate(Fixed(), Made(), [0, 1], "cpu")
+    assert evaluate.score_mask(Fixed(), Made(), [0, 1], "cpu", shift)["iou"] == pytest.approx(0.98, abs=1e-3)
+    assert -3.001 <= shift < -1.9
 
 
 def test_committed_golden_files_are_what_pytorch_computes(tmp_path, request):
@@ -152,3 +160,60 @@ def test_a_network_refuses_what_it_cannot_build():
     with pytest.raises(ValueError, match="nowhere"):
         Network(layers, JOINT_INPUT)
     assert json.dumps(paper_joint_layers())
+
+
+def test_soft_argmax_finds_a_joint_between_cells_and_beyond_the_edge():
+    heat = torch.full((1, 2, 3, 4), -50.0)
+    votes = torch.zeros(1, 6, 3, 4)
+    # The first joint lies between columns 1 and 2 of row 2; the second is voted for from the corner, far outside.
+    heat[0, 0, 2, 1] = heat[0, 0, 2, 2] = heat[0, 1, 0, 0] = 50.0
+    votes[0, 2] = 0.7
+    votes[0, 3:5, 0, 0] = torch.tensor([-9.0, -8.0])
+    found = soft_argmax2d(heat, votes, (10.0, 20.0), (2.0, 4.0)).flatten().tolist()
+    assert found == pytest.approx([13.0, 28.0, 0.7, 1.0, 12.0, 0.0])
+    points = back_project(torch.tensor([0.5, -0.25, 0.7]).reshape(1, 3, 1, 1)).flatten().tolist()
+    assert points == pytest.approx([0.5 * math.exp(0.7), -0.25 * math.exp(0.7), math.exp(0.7)])
+
+
+def test_the_heat_maps_are_drawn_to_the_joints_in_view():
+    place = {"origin": [-1.0, -1.0], "step": [0.5, 0.5]}
+    truth = torch.tensor([[[0.5, -0.5, 1.0], [9.0, 0.0, 1.0]]])
+    right, wrong = torch.zeros(1, 2, 5, 5), torch.zeros(1, 2, 5, 5)
+    right[0, 0, 1, 3] = wrong[0, 0, 3, 1] = 1.5
+    assert heat_loss(right, place, truth) < heat_loss(torch.zeros(1, 2, 5, 5), place, truth)
+    assert heat_loss(torch.zeros(1, 2, 5, 5), place, truth) < heat_loss(wrong, place, truth)
+    beyond = right.clone()
+    beyond[0, 1, 2, 2] = 30.0
+    assert heat_loss(beyond, place, truth) == heat_loss(right, place, truth)
+
+
+def test_one_command_trains_two_robots_and_goes_on(recording, tmp_path, capsys):
+    other = tmp_path / "other"
+    shutil.copytree(recording, other)
+    header = json.loads((other / "recording.json").read_text())
+    (other / "recording.json").write_text(json.dumps(header | {"robot": "ur10"}))
+    command = ["train", "--recording", str(recording), str(other), "--out", str(tmp_path / "out"), "--minutes", "0.02",
+               "--cache", str(tmp_path / "cache")]
+    main(command)
+    for robot in ("ur5", "ur10"):
+        _, _, description = read_model(tmp_path / "out" / f"{robot}.safetensors")
+        assert description["robot"] == robot and description["family"] == "context"
+    assert "--resume" not in capsys.readouterr().out
+    before = (tmp_path / "out" / "mask" / "log.csv").read_text()
+    main(command)
+    assert capsys.readouterr().out.count("--resume") == 4
+    assert (tmp_path / "out" / "mask" / "log.csv").read_text() == before
+    with pytest.raises(SystemExit, match="is of ur10"):
+        main([*command[:2], str(recording), "--validation", str(other), *command[4:]])
+
+
+def test_a_start_from_other_weights_is_the_same_function():
+    torch.manual_seed(0)
+    layers = context_mask_layers()
+    trained, fresh = Network(layers, MASK_INPUT).eval(), Network(layers, MASK_INPUT, normalise=True)
+    images = torch.rand(2, 3, 212, 256)
+    assert not torch.allclose(fresh.eval()(images), trained(images), atol=1e-3)
+    start_from(fresh, trained.state_dict(), images)
+    assert torch.allclose(fresh.eval()(images), trained(images), atol=1e-4)
+    with pytest.raises(SystemExit, match="conv1.weight"):
+        start_from(fresh, Network(paper_mask_layers(), MASK_INPUT).state_dict(), images)

@@ -4,7 +4,7 @@ import argparse
 
 import torch
 
-from . import export, golden, train
+from . import export, golden, pipeline, train
 
 
 def _training_flags(parser, *, minutes, batch, learning_rate, momentum, dilations):
@@ -13,7 +13,10 @@ def _training_flags(parser, *, minutes, batch, learning_rate, momentum, dilation
                         help="recordings to validate on (without: a random fifth of the others)")
     parser.add_argument("--validation-samples", type=int, default=100, metavar="N",
                         help="validate on at most so many samples (%(default)s)")
-    parser.add_argument("--out", required=True, metavar="RUN", help="folder for checkpoints, log.csv and settings.json")
+    parser.add_argument("--samples", type=int, metavar="N", help="train on at most so many samples")
+    parser.add_argument("--init-from", metavar="MODEL", help="start from the weights of a model file, of any robot, or of"
+                        " another run's folder")
+    parser.add_argument("--out", required=True, metavar="RUN", help="folder for the checkpoint, log.csv and settings.json")
     parser.add_argument("--resume", action="store_true", help="go on from RUN/last.pt")
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--minutes", type=float, default=minutes, metavar="M",
@@ -66,6 +69,22 @@ def main(argv=None):
     parser = argparse.ArgumentParser(prog="whereabot_trainer", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
+    command = commands.add_parser("train", help="train and export one robot or several, from recordings to model files")
+    command.add_argument("--recording", nargs="+", required=True, metavar="DIR", help="recordings to train on")
+    command.add_argument("--validation", nargs="+", metavar="DIR",
+                         help="recordings to validate on (without: the fifth of the others that is kept for testing)")
+    command.add_argument("--family", choices=("paper", "context"), default="context",
+                         help="the paper's networks, for each robot its own, or the context family's, whose mask network is"
+                         " shared and whose joint networks start from a common one (%(default)s)")
+    command.add_argument("--negatives", nargs="+", metavar="DIR", help="folders of photographs without a robot")
+    command.add_argument("--minutes", type=float, default=120, metavar="M", help="of training in all (%(default)s)")
+    command.add_argument("--out", required=True, metavar="DIR", help="folder for runs and model files; called again, it"
+                         " goes on where it stopped")
+    command.add_argument("--dtype", choices=("f32", "f16"), default="f16", help="of the tensors (%(default)s)")
+    command.add_argument("--cache", default=".cache", metavar="DIR", help="folder for decoded, halved images (%(default)s)")
+    command.add_argument("--seed", type=int, default=1, metavar="S", help="of weights and order (%(default)s)")
+    command.set_defaults(run=lambda args: pipeline.run(args, main))
+
     command = commands.add_parser("train-mask", help="train the mask network")
     _training_flags(command, minutes=40, batch=8, learning_rate=(4e-3, 2e-5), momentum=(0.9, 0.9),
                     dilations=(1, 2, 4, 8, 1))
@@ -83,6 +102,10 @@ def main(argv=None):
 
     command = commands.add_parser("train-joint", help="train the joint network")
     _training_flags(command, minutes=35, batch=16, learning_rate=(2e-3, 2e-5), momentum=(0.9, 0.95), dilations=(1, 2, 4))
+    command.add_argument("--family", choices=("paper", "context"), default="paper",
+                         help="the paper's network, or heat maps with votes, without --dilations and --pool (%(default)s)")
+    command.add_argument("--heat-weight", type=float, default=0.02, metavar="W",
+                         help="weight of the heat maps' own loss, context family alone (%(default)s)")
     command.add_argument("--pool", type=int, default=4, metavar="P", help="size of both max-pools (%(default)s)")
     command.add_argument("--overlay", choices=("threshold", "multiply"), default="threshold",
                          help="colour where the mask is at least 0.5, or colour times mask (%(default)s)")
@@ -98,17 +121,15 @@ def main(argv=None):
     command = commands.add_parser("export", help="write both networks as a model file")
     command.add_argument("--mask", required=True, metavar="RUN")
     command.add_argument("--joint", required=True, metavar="RUN")
-    command.add_argument("--validation", nargs="+", required=True, metavar="DIR",
-                         help="recordings to choose the presence threshold and measure the figures on")
+    source = command.add_mutually_exclusive_group(required=True)
+    source.add_argument("--validation", nargs="+", metavar="DIR",
+                        help="recordings to choose the presence threshold and measure the figures on")
+    source.add_argument("--recording", nargs="+", metavar="DIR",
+                        help="recordings trained on: figures on the fifth of them that is kept for testing")
     command.add_argument("--validation-samples", type=int, default=100, metavar="N",
-                         help="choose on N, the ones training validated on, and report on the rest (%(default)s)")
-    command.add_argument("--photos", metavar="DIR", help="annotated photos, to report the mask's IoU on")
-    command.add_argument("--annotations", metavar="FILE", help="annotations of --photos")
-    command.add_argument("--photos-without", nargs="*", default=[], metavar="DIR",
-                         help="folders of photos without a robot, to report how many are rejected")
+                         help="choose on N samples, the ones training validated on, and report on others (%(default)s)")
     command.add_argument("--out", required=True, metavar="FILE")
     command.add_argument("--dtype", choices=("f32", "f16"), default="f32", help="of the tensors (%(default)s)")
-    command.add_argument("--robot", default="ur5", help="(%(default)s)")
     command.add_argument("--note", default="", metavar="TEXT", help="what the card is to say about the data")
     command.add_argument("--licence", default="MIT OR Apache-2.0", help="of the weights (%(default)s)")
     _machine_flags(command)

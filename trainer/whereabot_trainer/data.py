@@ -127,11 +127,12 @@ class Samples:
     """Samples of one or more recordings, by number.
 
     `joints` is [N, 6, 3] in metres in the camera's optical frame, NaN where there is no robot; `coverage` [N] is the
-    share of robot pixels; `ids` [N] are the samples' ids in their recordings.
+    share of robot pixels; `ids` [N] are the samples' ids in their recordings; `robots` [N] are the robots' names.
+    `arms` [N] is the length of the robot's arm in metres (see `arm_length`): all recordings of a robot have the same.
     """
 
     def __init__(self, folders, cache):
-        self.parts, joints, coverage, ids, self.sources = [], [], [], [], []
+        self.parts, joints, coverage, ids, robots, self.sources = [], [], [], [], [], []
         for folder in folders:
             header, samples = read_header(folder), read_samples(folder)
             if not samples:
@@ -142,10 +143,16 @@ class Samples:
             joints += [sample.get("joints_m", absent) for sample in samples]
             coverage.append(masks.mean((1, 2)))
             ids += [sample["id"] for sample in samples]
-            self.sources.append({"name": Path(folder).name, "samples": len(samples), **header.get("source", {})})
+            robots += [header["robot"]] * len(samples)
+            self.sources.append({"name": Path(folder).name, "robot": header["robot"], "samples": len(samples),
+                                 **header.get("source", {})})
         self.joints = np.asarray(joints, np.float32)
         self.coverage = np.concatenate(coverage)
         self.ids = np.asarray(ids)
+        self.robots = np.asarray(robots)
+        self.arms = np.empty(len(self.joints), np.float32)
+        for robot in set(robots):
+            self.arms[self.robots == robot] = arm_length(self.joints[self.robots == robot])
         self._starts = np.cumsum([0] + [len(images) for images, _ in self.parts])
 
     def __len__(self):
@@ -157,40 +164,62 @@ class Samples:
 
     def pixels(self, numbers):
         """(images [N, 3, H, W] in [0, 1], masks [N, 1, H, W] of 0 and 1) as f32 tensors."""
+        images, masks = self.bytes(numbers)
+        return images.permute(0, 3, 1, 2).float() / 255, masks
+
+    def bytes(self, numbers):
+        """(images uint8 [N, H, W, 3], masks f32 [N, 1, H, W] of 0 and 1)."""
         images = np.empty((len(numbers), INPUT_HEIGHT, INPUT_WIDTH, 3), np.uint8)
         masks = np.empty((len(numbers), INPUT_HEIGHT, INPUT_WIDTH), np.uint8)
         for row, number in enumerate(numbers):
             part = np.searchsorted(self._starts, number, "right") - 1
             images[row] = self.parts[part][0][number - self._starts[part]]
             masks[row] = self.parts[part][1][number - self._starts[part]]
-        return torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255, torch.from_numpy(masks)[:, None].float()
+        return torch.from_numpy(images), torch.from_numpy(masks)[:, None].float()
 
 
 def read_negatives(folders, cache):
-    """Photographs without a robot as uint8 [N, 3, 212, 256], cut to fill the networks' input; decoded once."""
+    """Photographs without a robot as uint8 [N, 212, 256, 3], cut to fill the networks' input; decoded once."""
     paths = sorted(path for folder in folders for path in Path(folder).resolve().iterdir()
                    if path.suffix.lower() in {".jpg", ".jpeg", ".png", ".webp"})
     if not paths:
         raise RecordingError(f"no photographs in {', '.join(map(str, folders))}")
     names = "\n".join(map(str, paths))
-    stored = Path(cache) / f"negatives-{hashlib.sha256(names.encode()).hexdigest()[:8]}.npy"
+    stored = Path(cache) / f"photographs-{hashlib.sha256(names.encode()).hexdigest()[:8]}.npy"
     if not stored.exists():
         stored.parent.mkdir(parents=True, exist_ok=True)
         pictures = []
         for path in tqdm(paths, "decoding photographs", mininterval=5):
             with Image.open(path) as file:
                 pictures.append(np.asarray(ImageOps.fit(file.convert("RGB"), (INPUT_WIDTH, INPUT_HEIGHT))))
-        np.save(stored, np.stack(pictures).transpose(0, 3, 1, 2))
-    return torch.from_numpy(np.load(stored))
+        np.save(stored, np.stack(pictures))
+    return np.load(stored, mmap_mode="r")
 
 
-def split(samples, seed, validation_share=0.2):
-    """(training, validation) numbers, at random by seed.
+def arm_length(joints):
+    """Shoulder to elbow to wrist, metres: the median over samples [N, 6, 3]; 1 where no sample has a robot.
 
-    Each sample's side depends on its id alone, so a recording that has grown since keeps its split.
+    Robots of one make are nearly the same but for their size; in this unit, they are nearly the same.
     """
-    draws = np.array([np.random.default_rng([seed, int(number)]).random() for number in samples.ids])
-    return np.flatnonzero(draws >= validation_share), np.flatnonzero(draws < validation_share)
+    shoulder, elbow, wrist = (joints[:, JOINTS.index(name)] for name in ("shoulder_lift", "elbow", "wrist_1"))
+    lengths = np.linalg.norm(elbow - shoulder, axis=1) + np.linalg.norm(wrist - elbow, axis=1)
+    lengths = lengths[np.isfinite(lengths)]
+    return float(np.median(lengths)) if len(lengths) else 1.0
+
+
+def is_test(ids):
+    """Which samples of a recording are kept for testing: one in five, told by splitmix64 of the sample's id, as
+    everything that reads recordings does it (paper, section 2: 80 % and 20 % at random)."""
+    z = (np.asarray(ids, np.uint64) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return (z ^ (z >> np.uint64(31))) % np.uint64(5) == 0
+
+
+def split(samples):
+    """(training, test) numbers."""
+    test = is_test(samples.ids)
+    return np.flatnonzero(~test), np.flatnonzero(test)
 
 
 # --- augmentation ----------------------------------------------------------------------------------------------------
@@ -200,26 +229,35 @@ def _uniform(count, low, high, *shape):
 
 
 def jitter_colours(images):
-    """Other light and another camera: gain, white balance, contrast, saturation, gamma, blur and noise."""
-    # A few images at a time stay in a CPU's cache through all of these passes.
-    return torch.cat([_jitter_colours(part) for part in images.split(4)])
+    """Other light and another camera: gain, white balance, gamma, saturation, contrast, blur and noise.
+
+    From uint8 [N, H, W, 3] to f32 [N, 3, H, W] in [0, 1], in memory as before: the format that convolutions like best.
+    """
+    # On a CPU, one image at a time stays in the cache through all of these passes.
+    parts = images.split(1 if images.device.type == "cpu" else len(images))
+    return torch.cat([_jitter_colours(part) for part in parts]).permute(0, 3, 1, 2)
 
 
 def _jitter_colours(images):
-    count = len(images)
-    images = images * (_uniform(count, 0.75, 1.25, 1, 1, 1) * _uniform(count, 0.93, 1.07, 3, 1, 1))
-    grey = images.mean(1, keepdim=True)
-    images = torch.lerp(grey, images, _uniform(count, 0.6, 1.4, 1, 1, 1))
-    level = grey.mean((2, 3), keepdim=True)
-    images = torch.lerp(level, images, _uniform(count, 0.8, 1.2, 1, 1, 1)).clamp_(1e-3, 1)
-    images = images.pow_(torch.exp(_uniform(count, -0.25, 0.25, 1, 1, 1)))
-    if torch.rand(()) < 0.25:
-        soft = torch.nn.functional.avg_pool2d(images, 3, 1, 1, count_include_pad=False)
+    count, height, width, _ = images.shape
+    images = images.reshape(count, -1, 3) * (
+        _uniform(count, 0.75 / 255, 1.25 / 255, 1, 1) * _uniform(count, 0.93, 1.07, 1, 3))
+    images = images.clamp_(1e-3, 1).pow_(torch.exp(_uniform(count, -0.25, 0.25, 1, 1)))
+    contrast, saturation = _uniform(count, 0.8, 1.2, 1, 1), _uniform(count, 0.6, 1.4, 1, 1)
+    mixing = contrast * (saturation * torch.eye(3) + (1 - saturation) / 3)
+    images = torch.baddbmm((1 - contrast) * images[:, ::7].mean((1, 2), keepdim=True), images, mixing)
+    blurred = torch.rand(count) < 0.25
+    if blurred.any():
+        planes = images[blurred].reshape(-1, height, width, 3).permute(0, 3, 1, 2)
+        soft = torch.nn.functional.avg_pool2d(planes, 3, 1, 1, count_include_pad=False)
         # Between sharpened (-0.5) and blurred (1).
-        images = torch.lerp(images, soft, _uniform(count, -0.5, 1, 1, 1, 1))
-    if torch.rand(()) < 0.5:
-        images = images + torch.empty_like(images).uniform_(-1, 1) * _uniform(count, 0, 0.08, 1, 1, 1)
-    return images.clamp(0, 1)
+        planes = torch.lerp(planes, soft, _uniform(len(planes), -0.5, 1, 1, 1, 1))
+        images[blurred] = planes.permute(0, 2, 3, 1).reshape(len(planes), -1, 3)
+    noisy = torch.rand(count) < 0.5
+    if noisy.any():
+        noise = torch.empty_like(images[noisy]).uniform_(-1, 1)
+        images[noisy] += noise * _uniform(len(noise), 0, 0.08, 1, 1)
+    return images.clamp_(0, 1).reshape(count, height, width, 3)
 
 
 def random_views(images, masks, height, width, tilt_degrees=10, zoom=(0.7, 1.6)):

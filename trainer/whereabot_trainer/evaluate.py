@@ -71,15 +71,17 @@ def figures_by_threshold(robot, background):
     }
 
 
-def score_mask(network, samples, numbers, device):
-    """Figures at the threshold 0.5, and the shift of the logit that gives the best IoU there."""
+def calibrate(network, samples, numbers, device):
+    """The shift of the logit that gives the best IoU at the threshold 0.5."""
     curves = figures_by_threshold(*mask_histograms(network, samples, numbers, device))
-    half = int(np.argmin(np.abs(LOGIT_EDGES[:-1])))
-    best = int(curves["iou"].argmax())
-    figures = {name: round(float(curve[half]), 4) for name, curve in curves.items()}
-    return figures | {"calibrated_iou": round(float(curves["iou"][best]), 4),
-                      "calibrated_accuracy": round(float(curves["accuracy"][best]), 4),
-                      "logit_shift": round(float(-LOGIT_EDGES[best]), 3)}
+    return round(float(-LOGIT_EDGES[int(curves["iou"].argmax())]), 3)
+
+
+def score_mask(network, samples, numbers, device, shift=0.0):
+    """Figures at the threshold 0.5, the logits being shifted."""
+    curves = figures_by_threshold(*mask_histograms(network, samples, numbers, device))
+    half = int(np.argmin(np.abs(LOGIT_EDGES[:-1] + shift)))
+    return {name: round(float(curve[half]), 4) for name, curve in curves.items()}
 
 
 @torch.no_grad()
@@ -92,7 +94,8 @@ def joint_errors(network, metres, samples, numbers, estimated, rule, device):
             masks = torch.stack([torch.from_numpy(estimated[int(number)])[None].float() / 255 for number in batch])
         outputs = network(overlay(images, masks, rule).to(device).contiguous(memory_format=torch.channels_last))
         truth = torch.from_numpy(samples.joints[batch])
-        errors.append(losses.joint_distances(metres(outputs).cpu(), truth).numpy())
+        arms = torch.from_numpy(samples.arms[batch]).to(device)
+        errors.append(losses.joint_distances(metres(outputs, arms).cpu(), truth).numpy())
     return np.concatenate(errors)
 
 
@@ -102,6 +105,6 @@ def score_joints(network, metres, samples, numbers, estimated, rule, device, nam
     return {f"{name}_mean_cm": round(float(each.mean()), 2), f"{name}_median_cm": round(float(np.median(each)), 2)}
 
 
-def identity_metres(outputs):
+def identity_metres(outputs, _arms):
     """The joints [N, 6, 3] of an exported joint network, whose outputs are metres."""
     return outputs.reshape(-1, len(JOINTS), 3)

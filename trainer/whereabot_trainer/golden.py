@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_file
 
-from .export import describe, read_model, write_model
+from .model import describe, read_model, write_model
 from .networks import JOINT_INPUT, JOINTS, MASK_INPUT, Network, overlay
 
 WIDTH, HEIGHT = 20, 14
@@ -93,7 +93,9 @@ def cascade_activations(mask, joint, rule, image):
     values = {f"mask.{name}": value[0] for name, value in mask.activations(image[None]).items()}
     seen = overlay(image[None], values["mask.mask"][None], rule)
     values |= {f"joint.{name}": value[0] for name, value in joint.activations(seen).items()}
-    values["joints"] = values["joint.dense"].clone()
+    # A vector, not an image of one pixel.
+    values = {name: value.flatten() if value.shape[1:] == (1, 1) else value for name, value in values.items()}
+    values["joints"] = values[f"joint.{joint.layers[-1]['name']}"].clone()
     return {name: value.contiguous() for name, value in values.items()}
 
 

@@ -80,6 +80,55 @@ def paper_joint_layers(dilations=(1, 1, 1), pool=2, outputs=18):
     return layers
 
 
+def heatmap_joint_layers(camera=CAMERA):
+    """The context family's joint network: heat maps and votes at an eighth of the resolution, instead of one dense layer
+    over all pixels.
+
+    For each joint, every cell has a weight (the softmax of the joint's heat map) and votes for the joint's place: an
+    offset from the cell, so that joints beyond the image's edge or behind something can be voted for too, and the
+    logarithm of the depth. Places are slopes x / z and y / z. Dense layers then correct all joints in the light of each
+    other, as an arm's proportions ask for.
+    """
+    cell = 8
+    layers, source = [], JOINT_INPUT
+
+    def conv(channels, kernel=3, dilation=1, activation="relu", name=None, of=None):
+        nonlocal source
+        number = sum(layer["op"] == "conv2d" for layer in layers) + 1
+        layers.append({"name": name or f"conv{number}", "op": "conv2d", "inputs": [of or source],
+                       "out_channels": channels, "kernel": kernel, "dilation": dilation, "activation": activation})
+        source = layers[-1]["name"]
+
+    def pool(number):
+        nonlocal source
+        layers.append({"name": f"pool{number}", "op": "max_pool2d", "inputs": [source], "size": 2})
+        source = layers[-1]["name"]
+
+    conv(16)
+    pool(1)
+    conv(32)
+    pool(2)
+    conv(64)
+    conv(64)
+    pool(3)
+    for dilation in (1, 2, 4, 8, 1):
+        conv(128, dilation=dilation)
+    trunk, joints = source, len(JOINTS)
+    conv(joints, kernel=1, activation="none", name="heat", of=trunk)
+    conv(3 * joints, kernel=1, activation="none", name="votes", of=trunk)
+    slope = {axis: cell / camera[f"f{axis}"] for axis in "xy"}
+    # The middle of the first cell, pixel (0, 0) being a pixel's centre.
+    first = {axis: ((cell - 1) / 2 - camera[f"c{axis}"]) / camera[f"f{axis}"] for axis in "xy"}
+    return layers + [
+        {"name": "place", "op": "soft_argmax2d", "inputs": ["heat", "votes"],
+         "origin": [first["x"], first["y"]], "step": [slope["x"], slope["y"]]},
+        {"name": "dense1", "op": "dense", "inputs": ["place"], "out_features": 128, "activation": "relu"},
+        {"name": "places", "op": "concat", "inputs": ["place", "dense1"]},
+        {"name": "dense2", "op": "dense", "inputs": ["places"], "out_features": 3 * joints, "activation": "none"},
+        {"name": "joints", "op": "back_project", "inputs": ["dense2"]},
+    ]
+
+
 class Network(nn.Module):
     """A layer list as a PyTorch module; its state_dict keys are `{layer}.weight` and `{layer}.bias`.
 
@@ -101,7 +150,8 @@ class Network(nn.Module):
                 if source not in shapes:
                     raise ValueError(f"layer {name!r} reads {source!r}, which no earlier layer makes")
             sources = [shapes[source] for source in layer["inputs"]]
-            if len({tuple(shape[1:]) for shape in sources}) != 1 or (len(sources) > 1) != (op == "concat"):
+            counts = {"concat": len(sources) > 1, "soft_argmax2d": len(sources) == 2}
+            if len({tuple(shape[1:]) for shape in sources}) != 1 or not counts.get(op, len(sources) == 1):
                 raise ValueError(f"layer {name!r}: {op} cannot read inputs of shapes {sources}")
             channels, *size = sources[0]
             if op == "conv2d":
@@ -115,13 +165,21 @@ class Network(nn.Module):
                 shapes[name] = (channels, *(extent // layer["size"] for extent in size))
             elif op == "dense":
                 self.add_module(name, nn.Linear(math.prod(sources[0]), layer["out_features"]))
-                shapes[name] = (layer["out_features"],)
+                shapes[name] = (layer["out_features"], 1, 1)
             elif op == "sigmoid":
                 shapes[name] = sources[0]
             elif op == "upsample2d":
                 shapes[name] = (channels, *(extent * layer["scale"] for extent in size))
             elif op == "concat":
                 shapes[name] = (sum(shape[0] for shape in sources), *size)
+            elif op == "soft_argmax2d":
+                if sources[1][0] != 3 * channels:
+                    raise ValueError(f"layer {name!r}: expected {3 * channels} channels of votes, found {sources[1][0]}")
+                shapes[name] = (3 * channels, 1, 1)
+            elif op == "back_project":
+                if channels % 3 or size != [1, 1]:
+                    raise ValueError(f"layer {name!r}: expected triples without extent, found {sources[0]}")
+                shapes[name] = sources[0]
             else:
                 raise ValueError(f"layer {name!r} has the unknown op {op!r}")
         self.shapes = shapes
@@ -141,7 +199,7 @@ class Network(nn.Module):
             elif op == "dense":
                 # In bfloat16 the rounding of coordinates alone would cost millimetres.
                 with torch.autocast(value.device.type, enabled=False):
-                    value = getattr(self, name)(value.float().flatten(1))
+                    value = getattr(self, name)(value.float().flatten(1))[:, :, None, None]
             elif op == "sigmoid":
                 value = torch.sigmoid(value.float())
             elif op == "upsample2d":
@@ -149,6 +207,10 @@ class Network(nn.Module):
                     value, scale_factor=layer["scale"], mode="bilinear", align_corners=False)
             elif op == "concat":
                 value = torch.cat([values[source] for source in layer["inputs"]], 1)
+            elif op == "soft_argmax2d":
+                value = soft_argmax2d(value, values[layer["inputs"][1]], layer["origin"], layer["step"])
+            elif op == "back_project":
+                value = back_project(value)
             activation = layer.get("activation", "none")
             if activation == "relu":
                 value = torch.relu(value)
@@ -175,6 +237,31 @@ class Network(nn.Module):
                 convolution.bias.copy_((convolution.bias - norm.running_mean) * scale + norm.bias)
         self.normalise = False
         return self
+
+
+def soft_argmax2d(heat, votes, origin, step):
+    """(x, y, value) of each joint, [N, 3 J, 1, 1]: the expectation, under the softmax of its heat map [N, J, h, w], of
+    what the cells vote for [N, 3 J, h, w]. Cell (column, row) is at origin + step (column, row); its first two votes
+    are an offset from there.
+
+    Integral regression (Sun et al., 2018, "Integral human pose regression"), with offsets.
+    """
+    count, joints, height, width = heat.shape
+    share = torch.softmax(heat.float().flatten(2), 2)
+    votes = votes.float().reshape(count, joints, 3, height * width)
+    columns = torch.arange(width, dtype=torch.float32, device=heat.device)
+    rows = torch.arange(height, dtype=torch.float32, device=heat.device)
+    x = (origin[0] + step[0] * columns).expand(height, width).reshape(-1)
+    y = (origin[1] + step[1] * rows)[:, None].expand(height, width).reshape(-1)
+    cells = torch.stack([x, y, torch.zeros_like(x)])
+    return ((votes + cells) * share[:, :, None]).sum(3).reshape(count, 3 * joints, 1, 1)
+
+
+def back_project(places):
+    """Points (x, y, z) from slopes and logarithms of depth (x / z, y / z, log z), as triples in [N, 3 J, 1, 1]."""
+    slopes_x, slopes_y, log_z = places.float().unflatten(1, (-1, 3)).unbind(2)
+    z = torch.exp(log_z)
+    return torch.stack([slopes_x * z, slopes_y * z, z], 2).flatten(1, 2)
 
 
 def overlay(image, mask, rule):

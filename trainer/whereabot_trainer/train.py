@@ -11,8 +11,10 @@ import torch
 from tqdm import tqdm
 
 from . import data, evaluate, losses
+from .model import read_model
 from .networks import (
-    JOINT_INPUT, JOINTS, MASK_INPUT, Network, context_mask_layers, overlay, paper_joint_layers, paper_mask_layers)
+    JOINT_INPUT, JOINTS, MASK_INPUT, Network, context_mask_layers, heatmap_joint_layers, overlay, paper_joint_layers,
+    paper_mask_layers)
 
 
 # --- the loop --------------------------------------------------------------------------------------------------------
@@ -64,11 +66,11 @@ class Order:
         return self.numbers[taken]
 
 
-def fit(args, network, numbers, batch_loss, score, better, card):
+def fit(args, network, numbers, draw, batch_loss, score, card):
     """Trains `network` in the folder args.out.
 
-    `batch_loss(numbers, progress)` is the loss of a batch, `score()` the validation figures as a dict, of which
-    `better(figures)` is to be largest in best.pt. `card` goes into the checkpoints.
+    `draw(numbers, progress)` gives a batch's inputs and truth, `batch_loss(inputs, truth)` its loss, `score()` the
+    validation figures as a dict. `card` goes into the checkpoint. Rates decay to nearly nothing, so the last state is the one to use, and validation chooses nothing.
     """
     out = Path(args.out)
     out.mkdir(parents=True, exist_ok=True)
@@ -76,22 +78,16 @@ def fit(args, network, numbers, batch_loss, score, better, card):
     optimizer = make_optimizer(args.optimizer, network.parameters(), args.weight_decay)
     schedule = Schedule(args.learning_rate, args.momentum)
     order = Order(numbers, args.batch)
-    iteration, before, best = 0, 0.0, -math.inf
+    iteration, before = 0, 0.0
     last = out / "last.pt"
     if args.resume:
         state = torch.load(last, weights_only=False)
         network.load_state_dict(state["network"])
         optimizer.load_state_dict(state["optimizer"])
-        order.state, iteration, before, best = state["order"], state["iteration"], state["seconds"], state["best"]
+        order.state, iteration, before = state["order"], state["iteration"], state["seconds"]
         torch.set_rng_state(state["rng"])
     elif last.exists():
         raise SystemExit(f"{out} holds a run already: add --resume to go on with it, or choose another folder")
-
-    def save(path, **more):
-        partial = path.with_suffix(".partial")
-        torch.save({"layers": network.layers, "normalise": network.normalise, "network": network.state_dict(),
-                    "card": card, "iteration": iteration, "seconds": seconds, **more}, partial)
-        partial.replace(path)
 
     started, seconds, total, counted = time.monotonic(), before, 0.0, 0
     budget = args.iterations or 60 * args.minutes
@@ -100,8 +96,9 @@ def fit(args, network, numbers, batch_loss, score, better, card):
         while progress < 1:
             network.train()
             rate = schedule.apply(optimizer, progress)
+            inputs, truth = draw(next(order), progress)
             with torch.autocast(args.device, torch.bfloat16, enabled=args.precision == "bf16"):
-                loss = batch_loss(next(order), progress)
+                loss = batch_loss(inputs.contiguous(memory_format=torch.channels_last), truth)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             torch.nn.utils.clip_grad_norm_(network.parameters(), args.clip_gradient)
@@ -116,10 +113,12 @@ def fit(args, network, numbers, batch_loss, score, better, card):
                            "learning_rate": f"{rate:.3g}", "train_loss": round(total / counted, 5), **score()}
                 total, counted = 0.0, 0
                 _append_csv(out / "log.csv", figures)
-                if better(figures) > best:
-                    best = better(figures)
-                    save(out / "best.pt", figures=figures)
-                save(last, optimizer=optimizer.state_dict(), order=order.state, best=best, rng=torch.get_rng_state())
+                partial = last.with_suffix(".partial")
+                torch.save({"layers": network.layers, "normalise": network.normalise, "network": network.state_dict(),
+                            "card": card, "iteration": iteration, "seconds": seconds, "figures": figures,
+                            "optimizer": optimizer.state_dict(), "order": order.state, "rng": torch.get_rng_state()},
+                           partial)
+                partial.replace(last)
                 bar.set_postfix({key: figures[key] for key in list(figures)[4:]})
                 seconds = before + time.monotonic() - started
                 progress = max(progress, (iteration if args.iterations else seconds) / budget)
@@ -146,8 +145,10 @@ def load_samples(args):
         protocol = "validated on recordings of their own"
     else:
         held_out = samples
-        numbers, validation = data.split(samples, args.seed)
-        protocol = "80/20 random split"
+        numbers, validation = data.split(samples)
+        protocol = "80/20 split"
+    if args.samples and args.samples < len(numbers):
+        numbers = np.sort(np.random.default_rng(args.seed).permutation(numbers)[: args.samples])
     if len(validation) > args.validation_samples:
         validation = np.random.default_rng(args.seed).permutation(validation)[: args.validation_samples]
     card = {
@@ -169,12 +170,47 @@ def initialise(network):
     return network
 
 
-def load_network(run, name="best.pt"):
+def load_network(run):
     """(network in eval mode, without normalisation, checkpoint) of a run; its first layer tells the input's name."""
-    state = torch.load(Path(run) / name, weights_only=False, map_location="cpu")
+    state = torch.load(Path(run) / "last.pt", weights_only=False, map_location="cpu")
     network = Network(state["layers"], state["layers"][0]["inputs"][0], normalise=state["normalise"])
     network.load_state_dict(state["network"])
     return network.eval().fold_normalisation(), state
+
+
+@torch.no_grad()
+def start_from(network, tensors, images):
+    """Gives the untrained `network` another one's weights, whose normalisation is folded away, in place.
+
+    With normalisation, each layer's is set to undo itself on `images`: training goes on from the very same function.
+    """
+    own = network.state_dict()
+    for key, tensor in tensors.items():
+        if key not in own or own[key].shape != tensor.shape:
+            found = tuple(own[key].shape) if key in own else "none"
+            raise SystemExit(f"--init-from: {key}: expected {found}, found {tuple(tensor.shape)}: another family?")
+    network.load_state_dict(tensors, strict=False)
+
+    def undo(norm, inputs):
+        norm.running_mean.copy_(inputs[0].mean((0, 2, 3)))
+        norm.running_var.copy_(inputs[0].var((0, 2, 3)))
+        norm.weight.copy_(torch.sqrt(norm.running_var + norm.eps))
+        norm.bias.copy_(norm.running_mean)
+
+    hooks = [module.register_forward_pre_hook(undo) for module in network.modules()
+             if isinstance(module, torch.nn.BatchNorm2d)]
+    network.eval()(images)
+    for hook in hooks:
+        hook.remove()
+
+
+def starting_tensors(path, part):
+    """(the state dict of the `part`, mask or joint, card) of a run's folder or of a model file."""
+    if Path(path).is_dir():
+        network, state = load_network(path)
+        return network.state_dict(), state["card"]
+    mask, joint, description = read_model(path)
+    return {"mask": mask, "joint": joint}[part].state_dict(), description["card"]
 
 
 # --- the mask network ------------------------------------------------------------------------------------------------
@@ -188,28 +224,35 @@ def train_mask(args):
              "crop": args.crop, "zoom": args.zoom}
     layers = context_mask_layers() if args.family == "context" else paper_mask_layers(args.dilations)
     network = initialise(Network(layers, MASK_INPUT, normalise=args.normalise))
+    if args.init_from:
+        start_from(network, starting_tensors(args.init_from, "mask")[0], samples.pixels(numbers[:: len(numbers) // 64 + 1])[0])
+        card |= {"init_from": Path(args.init_from).name}
     network = network.to(args.device, memory_format=torch.channels_last)
 
     negatives = data.read_negatives(args.negatives, args.cache) if args.negatives else None
     if negatives is not None:
         card |= {"negatives": len(negatives), "negative_share": args.negative_share}
 
-    def batch_loss(batch, _progress):
-        images, masks = samples.pixels(batch)
+    def draw(batch, _progress):
+        images, masks = samples.bytes(batch)
         if negatives is not None:
             rows = torch.rand(len(batch), device="cpu") < args.negative_share
             drawn = torch.randint(len(negatives), (int(rows.sum()),), device="cpu")
-            images[rows], masks[rows] = negatives[drawn].float() / 255, 0.0
-        images, masks = images.to(args.device), masks.to(args.device)
-        images, masks = data.random_views(images, masks, height, width, zoom=args.zoom)
-        images = data.jitter_colours(images)
-        estimate = network(images.contiguous(memory_format=torch.channels_last))
-        return losses.mask_loss(estimate, masks, w_fg, w_bg)
+            images[rows], masks[rows] = torch.from_numpy(negatives[drawn.numpy()]), 0.0
+        images, masks = data.jitter_colours(images.to(args.device)), masks.to(args.device)
+        return data.random_views(images, masks, height, width, zoom=args.zoom)
+
+    def batch_loss(images, masks):
+        return losses.mask_loss(network(images), masks, w_fg, w_bg)
+
+    # What is reported on is not calibrated on: with a random split, the training samples are.
+    calibration = (held_out, validation) if args.validation else (samples, numbers[: args.validation_samples])
 
     def score():
-        return evaluate.score_mask(network, held_out, validation, args.device)
+        shift = evaluate.calibrate(network, *calibration, args.device)
+        return evaluate.score_mask(network, held_out, validation, args.device, shift) | {"logit_shift": shift}
 
-    fit(args, network, numbers, batch_loss, score, lambda figures: figures["calibrated_iou"], card)
+    fit(args, network, numbers, draw, batch_loss, score, card)
 
 
 # --- the joint network -----------------------------------------------------------------------------------------------
@@ -228,14 +271,86 @@ class Standardised:
         flat = joints.reshape(len(joints), -1)
         return cls(flat.mean(0), flat.std(0).clip(min=1e-3))
 
-    def metres(self, outputs):
-        return (outputs.float() * self.deviation + self.mean).reshape(-1, len(JOINTS), 3)
+    def metres(self, outputs, _arms):
+        outputs = outputs.float().flatten(1)
+        return (outputs * self.deviation.to(outputs.device) + self.mean.to(outputs.device)).reshape(-1, len(JOINTS), 3)
 
-    def fold(self, dense):
+    def fold(self, network, _arm):
         """Changes the last layer in place so that its outputs are metres."""
         with torch.no_grad():
-            dense.weight *= self.deviation[:, None]
-            dense.bias.copy_(dense.bias * self.deviation + self.mean)
+            network.dense.weight *= self.deviation[:, None]
+            network.dense.bias.copy_(network.dense.bias * self.deviation + self.mean)
+
+    def unfold(self, tensors, origin):
+        """Brings another network's tensors into this unit, in place; `origin` is its card."""
+        if "mean" in origin:
+            mean, deviation = (torch.as_tensor(origin[key]) for key in ("mean", "deviation"))
+            tensors["dense.weight"] = tensors["dense.weight"] * deviation[:, None]
+            tensors["dense.bias"] = tensors["dense.bias"] * deviation + mean
+        tensors["dense.weight"] = tensors["dense.weight"] / self.deviation[:, None]
+        tensors["dense.bias"] = (tensors["dense.bias"] - self.mean) / self.deviation
+
+    def card(self):
+        return {"mean": self.mean.tolist(), "deviation": self.deviation.tolist()}
+
+
+class ArmLengths:
+    """Joints [N, 6, 3] in metres and outputs in arm lengths, for networks that end in slopes and logarithms of depth:
+    the unit in which one network can learn from robots of several sizes, and a new robot starts from another's.
+
+    Export folds the arm's length into the last dense layer, exactly: it is a summand of the logarithm.
+    """
+
+    def metres(self, outputs, arms):
+        return outputs.float().reshape(-1, len(JOINTS), 3) * arms[:, None, None]
+
+    def fold(self, network, arm):
+        with torch.no_grad():
+            network.dense2.bias[2::3] += math.log(arm)
+
+    def unfold(self, tensors, origin):
+        # A run's network is in arm lengths already; a model file's is in metres and says how long its arm is.
+        tensors["dense2.bias"] = tensors["dense2.bias"].clone()
+        tensors["dense2.bias"][2::3] -= math.log(origin.get("arm_length_m", 1.0))
+
+    def card(self):
+        return {}
+
+
+def output_unit(card):
+    return Standardised(card["mean"], card["deviation"]) if "mean" in card else ArmLengths()
+
+
+def _prepare_heatmaps(network, joints):
+    """Sets the untrained network to a plain guess: everywhere alike, at the mean depth, and no correction."""
+    with torch.no_grad():
+        for name in ("heat", "votes", "dense2"):
+            getattr(network, name).weight.mul_(0.1)
+            getattr(network, name).bias.zero_()
+        network.votes.bias[2::3] = float(np.log(joints[..., 2]).mean())
+        outputs = network.dense2.out_features
+        network.dense2.weight[:, :outputs] = torch.eye(outputs)
+
+
+def heat_loss(heat, place, truth):
+    """How far the heat maps [N, J, h, w] are from the cells where the joints are: the cross-entropy with a bump of one
+    cell's width, over the joints [N, J, 3] that are in the image.
+
+    Without it the expectation alone would have to tell the heat maps where to look.
+    """
+    count, joints, height, width = heat.shape
+    device = heat.device
+    x = place["origin"][0] + place["step"][0] * torch.arange(width, device=device)
+    y = place["origin"][1] + place["step"][1] * torch.arange(height, device=device)
+    slope_x, slope_y = (truth[..., axis] / truth[..., 2] for axis in (0, 1))
+    bump_x = torch.exp(-0.5 * ((x - slope_x[..., None]) / place["step"][0]) ** 2)
+    bump_y = torch.exp(-0.5 * ((y - slope_y[..., None]) / place["step"][1]) ** 2)
+    target = (bump_y[..., :, None] * bump_x[..., None, :]).flatten(2)
+    mass = target.sum(2, keepdim=True)
+    inside = (mass > 1)[..., 0]
+    logs = torch.log_softmax(heat.float().flatten(2), 2)
+    entropies = -(target / mass.clamp(min=1) * logs).sum(2)
+    return (entropies * inside).sum() / inside.sum().clamp(min=1)
 
 
 def train_joint(args):
@@ -243,15 +358,24 @@ def train_joint(args):
     numbers, validation = (
         chosen[part.has_robot[chosen] & (part.coverage[chosen] >= args.min_coverage)]
         for part, chosen in ((samples, numbers), (held_out, validation)))
-    standard = Standardised.of(samples.joints[numbers])
-    standard.mean, standard.deviation = standard.mean.to(args.device), standard.deviation.to(args.device)
+    joints, arms = torch.from_numpy(samples.joints), torch.from_numpy(samples.arms)
     rule = {"rule": "threshold", "threshold": 0.5} if args.overlay == "threshold" else {"rule": "multiply"}
-    card |= {"samples": len(numbers), "overlay": rule, "min_coverage": args.min_coverage,
-             "estimated_masks": args.estimated_masks, "estimated_after": args.estimated_after,
-             "mean": standard.mean.tolist(), "deviation": standard.deviation.tolist()}
-    network = initialise(Network(paper_joint_layers(args.dilations, args.pool), JOINT_INPUT, normalise=args.normalise))
+    if args.family == "context":
+        unit, layers = ArmLengths(), heatmap_joint_layers()
+    else:
+        unit, layers = Standardised.of(samples.joints[numbers]), paper_joint_layers(args.dilations, args.pool)
+    card |= {"family": args.family, "samples": len(numbers), "overlay": rule, "min_coverage": args.min_coverage,
+             "heat_weight": args.heat_weight, "estimated_masks": args.estimated_masks, "estimated_after": args.estimated_after, **unit.card()}
+    network = initialise(Network(layers, JOINT_INPUT, normalise=args.normalise))
+    if args.family == "context":
+        _prepare_heatmaps(network, samples.joints[numbers] / samples.arms[numbers, None, None])
+    if args.init_from:
+        tensors, origin = starting_tensors(args.init_from, "joint")
+        unit.unfold(tensors, origin)
+        images, masks = samples.pixels(numbers[:: len(numbers) // 64 + 1])
+        start_from(network, tensors, overlay(images, masks, rule))
+        card |= {"init_from": Path(args.init_from).name}
     network = network.to(args.device, memory_format=torch.channels_last)
-    joints = torch.from_numpy(samples.joints)
 
     estimated = held_out_estimated = None
     if args.mask_run:
@@ -264,27 +388,34 @@ def train_joint(args):
     elif args.estimated_masks > 0:
         raise SystemExit("--estimated-masks needs --mask-run")
 
-    def batch_loss(batch, progress):
-        images, masks = samples.pixels(batch)
+    def draw(batch, progress):
+        images, masks = samples.bytes(batch)
         if estimated is not None and progress >= args.estimated_after:
             for row in torch.nonzero(torch.rand(len(batch), device="cpu") < args.estimated_masks).flatten():
                 masks[row, 0] = torch.from_numpy(estimated[int(batch[row])]).float() / 255
-        images, masks = images.to(args.device), masks.to(args.device)
-        overlays = data.erase_rectangles(overlay(data.jitter_colours(images), masks, rule))
+        images, masks = data.jitter_colours(images.to(args.device)), masks.to(args.device)
+        overlays = data.erase_rectangles(overlay(images, masks, rule))
         overlays, truth = data.rotate_camera(
             overlays, joints[batch].to(args.device), data.random_rotations(len(batch)))
-        outputs = network(overlays.contiguous(memory_format=torch.channels_last))
-        return losses.joint_loss(standard.metres(outputs), truth)
+        return overlays, (truth, arms[batch].to(args.device))
+
+    def batch_loss(overlays, joints_and_arms):
+        truth, size = joints_and_arms
+        values = network.activations(overlays)
+        # In arm lengths, so that a large robot does not count for more than a small one.
+        estimate = unit.metres(values[network.layers[-1]["name"]], size)
+        loss = losses.joint_loss(estimate / size[:, None, None], truth / size[:, None, None])
+        if args.family == "context":
+            place = next(layer for layer in network.layers if layer["op"] == "soft_argmax2d")
+            loss = loss + args.heat_weight * heat_loss(values["heat"], place, truth)
+        return loss
 
     def score():
         figures = {}
         for name, masks in (("true_mask", None), ("estimated_mask", held_out_estimated)):
             if name == "true_mask" or masks is not None:
                 figures |= evaluate.score_joints(
-                    network, standard.metres, held_out, validation, masks, rule, args.device, name)
+                    network, unit.metres, held_out, validation, masks, rule, args.device, name)
         return figures
 
-    def better(figures):
-        return -figures["true_mask_mean_cm"] - figures.get("estimated_mask_mean_cm", 0)
-
-    fit(args, network, numbers, batch_loss, score, better, card)
+    fit(args, network, numbers, draw, batch_loss, score, card)

@@ -1,0 +1,73 @@
+"""From recordings to model files in one command: the steps that the other commands do, one after the other.
+
+Each step is a command of its own (printed before it runs) with a run's folder of its own, so that an interrupted
+pipeline, called again, goes on where it stopped.
+"""
+
+import shlex
+from pathlib import Path
+
+from . import data
+
+# Shares of the time. The mask network is the larger one; what robots have in common is most of what there is to learn.
+MASK, COMMON = 0.45, 0.6
+
+
+def steps(args):
+    """The commands, as lists of words, for recordings of one robot or of several."""
+    by_robot = {}
+    for folder in args.recording:
+        by_robot.setdefault(data.read_header(folder)["robot"], ([], []))[0].append(folder)
+    for folder in args.validation or []:
+        robot = data.read_header(folder)["robot"]
+        if robot not in by_robot:
+            raise SystemExit(f"--validation: {folder} is of {robot}, of which there is no --recording")
+        by_robot[robot][1].append(folder)
+    out, commands = Path(args.out), []
+
+    def recordings(robots):
+        words = ["--recording", *(folder for robot in robots for folder in by_robot[robot][0])]
+        held_out = [folder for robot in robots for folder in by_robot[robot][1]]
+        return [*words, *(["--validation", *held_out] if held_out else [])]
+
+    def step(command, run, robots, minutes, *flags):
+        resume = ["--resume"] if (out / run / "last.pt").exists() else []
+        commands.append([command, "--family", args.family, *recordings(robots), "--out", str(out / run), "--minutes",
+                         f"{minutes:.4g}", "--cache", args.cache, "--seed", str(args.seed), *flags, *resume])
+
+    def joint(run, mask, robots, minutes, *flags):
+        step("train-joint", run, robots, minutes, "--mask-run", str(out / mask), "--estimated-masks", "0.5", *flags)
+
+    if args.family == "context":
+        views = ["--crop", "224", "184", "--zoom", "0.4", "2.0"]
+    else:
+        # Test images show what the training cameras see: there is little to gain from other sizes.
+        views = ["--crop", "192", "160", "--zoom", "0.85", "1.2"]
+    if args.negatives:
+        views += ["--negatives", *args.negatives]
+    robots = list(by_robot)
+    shared = args.family == "context" and len(robots) > 1
+    if shared:
+        # The arms look alike but for their size, which the network's unit takes out.
+        step("train-mask", "mask", robots, MASK * args.minutes, *views)
+        joint("joint", "mask", robots, (1 - MASK) * COMMON * args.minutes)
+        for robot in robots:
+            joint(f"joint-{robot}", "mask", [robot], (1 - MASK) * (1 - COMMON) * args.minutes / len(robots),
+                  "--init-from", str(out / "joint"), "--learning-rate", "5e-4", "2e-5")
+    else:
+        for robot in robots:
+            step("train-mask", f"mask-{robot}", [robot], MASK * args.minutes / len(robots), *views)
+            joint(f"joint-{robot}", f"mask-{robot}", [robot], (1 - MASK) * args.minutes / len(robots))
+    for robot in robots:
+        mask = "mask" if shared else f"mask-{robot}"
+        source = ["--validation", *by_robot[robot][1]] if by_robot[robot][1] else ["--recording", *by_robot[robot][0]]
+        commands.append(["export", "--mask", str(out / mask), "--joint", str(out / f"joint-{robot}"), *source,
+                         "--cache", args.cache, "--out", str(out / f"{robot}.safetensors"), "--dtype", args.dtype])
+    return commands
+
+
+def run(args, main):
+    """Runs all steps; `main` is the command line's."""
+    for words in steps(args):
+        print("whereabot_trainer", shlex.join(words), flush=True)
+        main(words)
