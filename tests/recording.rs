@@ -598,7 +598,7 @@ fn another_recording_is_not_overwritten() {
 
     fs::write(&lines, "{\"id\":7}\n").unwrap();
     let error = record(&device, &request, |_| {}).unwrap_err();
-    assert!(error.to_string().contains("line 1"), "{error}");
+    assert!(error.to_string().contains("samples.jsonl:1: "), "{error}");
 
     fs::remove_file(request.out.join("recording.json")).unwrap();
     let error = record(&device, &request, |_| {}).unwrap_err();

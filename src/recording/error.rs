@@ -94,6 +94,16 @@ pub enum RecordingError {
         /// The sample's number.
         id: u64,
     },
+    /// A sweep of the joints has too few poses that a fixed camera can see.
+    #[error(
+        "expected {wanted} poses without collision and with all joints in the picture, found {found}"
+    )]
+    TooFewPoses {
+        /// How many samples were asked for.
+        wanted: usize,
+        /// How many poses there are.
+        found: usize,
+    },
     /// The GPU could not draw.
     #[error(transparent)]
     Gpu(#[from] GpuError),

@@ -1,14 +1,16 @@
 //! A recording on disk: `recording.json`, `samples.jsonl`, `image/` and `mask/`.
 
-use std::fs::File;
-use std::io::{BufRead, BufReader, Write};
+use std::fs::{File, TryLockError};
+use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
+use super::reader::parse;
 use super::render::Picture;
 use super::{HEIGHT, RecordingError, WIDTH};
 use crate::camera::Intrinsics;
@@ -59,6 +61,10 @@ pub struct Source {
     /// How camera and robot move. Each synthetic recording has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub protocol: Option<Protocol>,
+    /// How many samples the recording shall have, where their poses depend on it
+    /// ([`Protocol::FixedCamera`]).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub planned: Option<u64>,
 }
 
 /// Whether a recording was rendered.
@@ -77,7 +83,8 @@ pub enum SourceKind {
 pub enum Protocol {
     /// Each sample has a camera, a background, a light and a look of its own; some have no robot.
     FreeCamera,
-    /// One camera and one look; the robot moves, backgrounds and light vary (the paper, section 3).
+    /// One camera and one look; all joints are swept through their ranges, the photo behind the robot and
+    /// the light vary (the paper, section 2).
     FixedCamera,
 }
 
@@ -135,37 +142,38 @@ impl Writer {
     /// complete line.
     ///
     /// # Errors
-    /// The folder holds another recording or other samples, or cannot be written.
+    /// The folder holds another recording (the error says what differs), wrong lines or other pictures,
+    /// another process is writing to it, or it cannot be written.
     pub fn open(folder: &Path, header: &Header) -> Result<Writer, RecordingError> {
         let header_path = folder.join("recording.json");
         let lines_path = folder.join("samples.jsonl");
         let taken = |path: &Path, message: &str| RecordingError::OutputTaken {
             path: path.to_owned(),
-            message: message.to_owned(),
+            message: format!("{message}: choose another folder"),
         };
-        for inside in ["image", "mask"] {
-            let inside = folder.join(inside);
-            std::fs::create_dir_all(&inside).map_err(RecordingError::io(&inside))?;
-        }
         if header_path.exists() {
-            let text =
-                std::fs::read_to_string(&header_path).map_err(RecordingError::io(&header_path))?;
-            let found = serde_json::from_str::<Header>(&text);
-            if !found.is_ok_and(|found| found == *header) {
-                let message = "holds a recording of another request: choose another folder";
-                return Err(taken(&header_path, message));
+            let found = Header::read(&header_path)?;
+            if let Some(difference) = difference(header, &found) {
+                let message = format!("holds another recording ({difference})");
+                return Err(taken(&header_path, &message));
             }
-        } else if lines_path.exists() {
-            return Err(taken(
-                &lines_path,
-                "samples without a recording.json: choose another folder",
-            ));
         } else {
+            for name in ["samples.jsonl", "image", "mask"] {
+                let path = folder.join(name);
+                if path.exists() {
+                    return Err(taken(&path, "part of something without a recording.json"));
+                }
+            }
+            std::fs::create_dir_all(folder).map_err(RecordingError::io(folder))?;
             let text = serde_json::to_string_pretty(header).map_err(|e| RecordingError::Io {
                 path: header_path.clone(),
                 cause: e.into(),
             })?;
             std::fs::write(&header_path, text + "\n").map_err(RecordingError::io(&header_path))?;
+        }
+        for inside in ["image", "mask"] {
+            let inside = folder.join(inside);
+            std::fs::create_dir_all(&inside).map_err(RecordingError::io(&inside))?;
         }
 
         let mut lines = File::options()
@@ -174,29 +182,25 @@ impl Writer {
             .create(true)
             .open(&lines_path)
             .map_err(RecordingError::io(&lines_path))?;
-        let mut next = 0;
-        let mut complete = 0;
-        let mut reader = BufReader::new(&mut lines);
-        let mut line = String::new();
-        while reader
-            .read_line(&mut line)
-            .map_err(RecordingError::io(&lines_path))?
-            > 0
-        {
-            if !line.ends_with('\n') {
-                break;
+        lines.try_lock().map_err(|error| match error {
+            TryLockError::WouldBlock => taken(&lines_path, "is being written by another process"),
+            TryLockError::Error(cause) => RecordingError::io(&lines_path)(cause),
+        })?;
+        let mut bytes = Vec::new();
+        lines
+            .read_to_end(&mut bytes)
+            .map_err(RecordingError::io(&lines_path))?;
+        let (mut next, mut complete) = (0, 0);
+        for line in bytes.split_inclusive(|&byte| byte == b'\n') {
+            if line.ends_with(b"\n") {
+                next += 1;
+                complete += line.len() as u64;
+                parse(header, next, line).map_err(|message| RecordingError::Line {
+                    path: lines_path.clone(),
+                    line: next,
+                    message,
+                })?;
             }
-            match serde_json::from_str::<Sample>(&line) {
-                Ok(sample) if sample.id == next => next += 1,
-                _ => {
-                    return Err(taken(
-                        &lines_path,
-                        &format!("line {} is not sample {next}", next + 1),
-                    ));
-                }
-            }
-            complete += line.len() as u64;
-            line.clear();
         }
         lines
             .set_len(complete)
@@ -235,6 +239,29 @@ impl Writer {
         self.next += 1;
         Ok(())
     }
+}
+
+/// The first thing in which two headers differ.
+fn difference(expected: &Header, found: &Header) -> Option<String> {
+    let expected = serde_json::to_value(expected).ok()?;
+    let found = serde_json::to_value(found).ok()?;
+    let flat = |header: &Value| -> Vec<(String, Value)> {
+        let fields = header.as_object().into_iter().flatten();
+        let (source, other): (Vec<_>, Vec<_>) = fields.partition(|(key, _)| *key == "source");
+        let inside = source.iter().filter_map(|(_, value)| value.as_object());
+        let inside = inside.flatten().map(|(k, v)| (format!("source.{k}"), v));
+        let other = other.into_iter().map(|(k, v)| (k.clone(), v));
+        other.chain(inside).map(|(k, v)| (k, v.clone())).collect()
+    };
+    let (expected, found) = (flat(&expected), flat(&found));
+    let of = |fields: &[(String, Value)], name: &str| {
+        let field = fields.iter().find(|(key, _)| key == name);
+        field.map_or(Value::Null, |(_, value)| value.clone())
+    };
+    expected.iter().chain(&found).find_map(|(key, _)| {
+        let (expected, found) = (of(&expected, key), of(&found, key));
+        (expected != found).then(|| format!("{key}: expected {expected}, found {found}"))
+    })
 }
 
 /// Writes a picture as sample `id`'s image (JPEG, quality 92) and mask (PNG).

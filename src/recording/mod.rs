@@ -16,9 +16,10 @@ mod render;
 mod robot;
 mod scene;
 mod stage;
+mod sweep;
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, mpsc};
 
@@ -62,12 +63,50 @@ pub struct Request {
     pub backgrounds: PathBuf,
     /// How many samples.
     pub samples: u64,
-    /// Samples are drawn from this seed and their number alone.
+    /// Samples are drawn from this seed and their number alone; with a fixed camera, also from
+    /// `samples`.
     pub seed: u64,
     /// How camera and robot move.
     pub protocol: Protocol,
     /// The recording's folder.
     pub out: PathBuf,
+}
+
+/// The paper's nine recordings: each robot's numbers of samples (the paper, table 1).
+pub const PAPER: [(&str, [u64; 3]); 3] = [
+    ("ur3", [211, 252, 463]),
+    ("ur5", [252, 756, 1512]),
+    ("ur10", [112, 278, 514]),
+];
+
+/// Requests for the paper's nine recordings, in the folders `ur3_1` to `ur10_3` of `out`, each with its
+/// own camera and look. `urdfs`: the descriptions of UR3, UR5 and UR10.
+pub fn paper_requests(
+    urdfs: [PathBuf; 3],
+    packages: &[(String, PathBuf)],
+    backgrounds: &Path,
+    seed: u64,
+    out: &Path,
+) -> Vec<Request> {
+    let recordings = PAPER.iter().zip(urdfs).flat_map(|((robot, counts), urdf)| {
+        let numbered = counts.iter().zip(1..);
+        numbered.map(move |(&samples, number)| (*robot, number, samples, urdf.clone()))
+    });
+    // No two of these are alike for any two seeds.
+    let seeds = (0..).map(|n| seed.wrapping_mul(9).wrapping_add(n));
+    recordings
+        .zip(seeds)
+        .map(|((robot, number, samples, urdf), seed)| Request {
+            urdf,
+            packages: packages.to_vec(),
+            robot: robot.to_owned(),
+            backgrounds: backgrounds.to_owned(),
+            samples,
+            seed,
+            protocol: Protocol::FixedCamera,
+            out: out.join(format!("{robot}_{number}")),
+        })
+        .collect()
 }
 
 /// Renders a recording; goes on with one that was cut off. `progress` hears how many samples are done.
@@ -104,10 +143,21 @@ pub fn record(
                 .file_name()
                 .map(|n| n.to_string_lossy().into_owned()),
             protocol: Some(request.protocol),
+            planned: (request.protocol == Protocol::FixedCamera).then_some(request.samples),
         },
     };
+    if request.out.join("recording.json").exists() {
+        let done = Writer::open(&request.out, &header)?.next();
+        if done >= request.samples {
+            progress(done);
+            return Ok(());
+        }
+    }
     let station = match request.protocol {
-        Protocol::FixedCamera => Some(stage.station(request.seed)?),
+        Protocol::FixedCamera => {
+            let samples = usize::try_from(request.samples).unwrap_or(usize::MAX);
+            Some(stage.station(request.seed, samples)?)
+        }
         Protocol::FreeCamera => None,
     };
     let renderer = Mutex::new(Renderer::new(device, stage.meshes())?);

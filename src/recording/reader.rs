@@ -178,7 +178,7 @@ impl Header {
 }
 
 /// A line with its end, checked; what is wrong with it otherwise.
-fn parse(header: &Header, line: u64, text: &[u8]) -> Result<Sample, String> {
+pub(super) fn parse(header: &Header, line: u64, text: &[u8]) -> Result<Sample, String> {
     let Some(text) = text.strip_suffix(b"\n") else {
         return Err("expected a whole line, found one without its end: \
              the recording is still being written, or was cut off"

@@ -7,6 +7,7 @@ use glam::{DAffine3, DMat3, DQuat, DVec3};
 use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
 
 use super::background::PhotoView;
 use super::chance::{direction, grey, hsv, normal};
@@ -16,6 +17,7 @@ use super::mesh::Mesh;
 use super::props::{Builder, MATT, PRIMITIVES, Support, lighting};
 use super::robot::Robot;
 use super::scene::{Item, Kind, Material, Scene};
+use super::sweep::Sweep;
 use super::{HEIGHT, INTRINSICS, RecordingError, WIDTH};
 
 /// The robot's part in a shot.
@@ -83,10 +85,11 @@ pub struct Stage {
     tool: Option<usize>,
 }
 
-/// What stays the same over a recording with a fixed camera.
+/// A recording with a fixed camera: what stays the same, and the robot's poses.
 pub struct Station {
     camera_from_base: DAffine3,
     seed: u64,
+    poses: Vec<Vec<f64>>,
 }
 
 impl Stage {
@@ -238,49 +241,119 @@ impl Stage {
         Err(RecordingError::NoScene { id })
     }
 
-    /// Sample `id` of a recording with a fixed camera.
+    /// Sample `id` of a recording with a fixed camera: the photo behind the robot and the light are the
+    /// sample's own, all else is the station's.
     ///
     /// # Errors
-    /// No pose without collision that stays in the picture was found.
+    /// The station has fewer samples.
     pub fn fixed_shot(
         &self,
         station: &Station,
         id: u64,
         photos: usize,
     ) -> Result<Shot, RecordingError> {
+        let pose = usize::try_from(id).ok().and_then(|i| station.poses.get(i));
+        let Some(angles) = pose else {
+            return Err(RecordingError::NoScene { id });
+        };
+        let poses = self.robot.link_poses(angles);
+        let camera_from_base = station.camera_from_base;
         let mut rng = ChaCha8Rng::seed_from_u64(station.seed);
         rng.set_stream(id);
         let mut look = station_rng(station.seed);
         let support = Support::any(&mut look);
-        for _ in 0..200 {
-            let Some(robot) = self.free_angles(&mut rng) else {
-                continue;
-            };
-            let camera = station.camera_from_base;
-            if self.in_view(camera, &robot.1, 4) {
-                return Ok(self.dress(camera, support, Some(robot), &mut look, &mut rng, photos));
-            }
+        let mut arm = self.robot.joint_origins(&poses);
+        arm.insert(0, DVec3::ZERO);
+        let centre = arm.iter().sum::<DVec3>() / arm.len() as f64;
+        let mut build = Builder {
+            items: Vec::new(),
+            camera: camera_from_base.inverse().translation,
+            arm,
+        };
+        support.build(&mut build, &mut look);
+        self.add_robot(&mut build, &poses, &mut look);
+        let texture = PhotoView::any(&mut look, photos, false);
+        if let Some(tool) = self.tool.and_then(|t| poses.get(t)) {
+            build.gripper(*tool, support.is_table(), &mut look);
         }
-        Err(RecordingError::NoScene { id })
+        let textured = build.items.iter().any(|item| item.material.photo > 0.0);
+        Ok(Shot {
+            scene: Scene {
+                camera_from_base,
+                items: build.items,
+                lighting: lighting(&mut rng),
+                centre,
+            },
+            background: PhotoView::any(&mut rng, photos, true),
+            texture: textured.then_some(texture),
+            effects: Effects::any(&mut rng),
+            robot: Some(Posed {
+                angles: angles.clone(),
+                joints: self.seen_from(camera_from_base, &poses),
+            }),
+        })
     }
 
-    /// Chooses the camera of a recording with a fixed camera: one that shows the robot on 6 to 17 % of
-    /// the picture in as many poses as possible (the paper, section 3).
+    /// The camera and the `samples` poses of a recording with a fixed camera (the paper, section 2): all
+    /// joints are swept through their ranges in equal steps, in combination, and poses in which the robot
+    /// meets itself or the floor, or has a joint outside the picture, are left out. The more samples,
+    /// the finer the steps.
+    ///
+    /// The camera is one that shows the robot whole and on 6 to 17 % of the picture (the paper, section 3)
+    /// in as many poses as possible.
     ///
     /// # Errors
-    /// The robot has no pose without collision.
-    pub fn station(&self, seed: u64) -> Result<Station, RecordingError> {
-        const POSES: usize = 40;
+    /// There are not as many such poses.
+    pub fn station(&self, seed: u64, samples: usize) -> Result<Station, RecordingError> {
+        let camera_from_base = self.station_camera(seed);
+        let kept = |sweep: &Sweep| -> Vec<Vec<f64>> {
+            let keep = |point: usize| {
+                let angles = sweep.angles(point);
+                let poses = self.robot.link_poses(&angles);
+                let seen = self.in_view(camera_from_base, &poses, self.robot.joints.len());
+                (seen && self.free(&poses)).then_some(angles)
+            };
+            (0..sweep.len()).into_par_iter().filter_map(keep).collect()
+        };
+        // So many points at most for each sample: more would say that hardly any pose can be seen.
+        const POINTS: usize = 400;
+        let mut sweep = Sweep::new(&self.robot, samples);
+        let mut poses = kept(&sweep);
+        while poses.len() < samples {
+            if sweep.len() > POINTS * samples {
+                return Err(RecordingError::TooFewPoses {
+                    wanted: samples,
+                    found: poses.len(),
+                });
+            }
+            let share = (poses.len() as f64 / sweep.len() as f64).max(0.01);
+            let wanted = (samples as f64 / share) as usize;
+            sweep = Sweep::new(&self.robot, wanted.max(sweep.len() + 1));
+            poses = kept(&sweep);
+        }
+        log::debug!("{} of {} poses of the sweep kept", poses.len(), sweep.len());
+        let evenly = |i: usize| poses.get(i * poses.len() / samples).cloned();
+        Ok(Station {
+            camera_from_base,
+            seed,
+            poses: (0..samples).filter_map(evenly).collect(),
+        })
+    }
+
+    fn station_camera(&self, seed: u64) -> DAffine3 {
+        const CAMERAS: usize = 100;
+        const POSES: usize = 60;
         let mut rng = station_rng(seed);
         let support = Support::any(&mut rng.clone());
-        let poses: Vec<Vec<DAffine3>> = (0..POSES)
-            .filter_map(|_| Some(self.free_angles(&mut rng)?.1))
+        let sweep = Sweep::new(&self.robot, 10 * POSES);
+        let poses: Vec<Vec<DAffine3>> = (0..sweep.len())
+            .step_by(sweep.len().div_ceil(5 * POSES))
+            .map(|point| self.robot.link_poses(&sweep.angles(point)))
+            .filter(|poses| self.free(poses))
+            .take(POSES)
             .collect();
-        if poses.is_empty() {
-            return Err(RecordingError::NoScene { id: 0 });
-        }
         let mut best = (-1.0, DAffine3::IDENTITY);
-        for _ in 0..60 {
+        for _ in 0..CAMERAS {
             let direction = direction(
                 &mut rng,
                 support.lowest_camera().max(5f64.to_radians()),
@@ -290,20 +363,31 @@ impl Stage {
             let aim = DVec3::new(0.0, 0.0, self.reach * rng.random_range(0.2..0.6));
             let pixel = [INTRINSICS.cx, INTRINSICS.cy + rng.random_range(-20.0..20.0)];
             let camera = look_at(aim, direction, distance, 0.0, pixel);
-            let mut score = 0.0;
-            for pose in &poses {
-                let coverage = self.coverage(camera, pose);
-                score += f64::from((0.06..0.17).contains(&coverage));
-                score += f64::from(self.in_view(camera, pose, self.robot.joints.len()));
-            }
+            // What is seen at another size counts against the camera.
+            let score: f64 = poses
+                .par_iter()
+                .filter(|pose| self.in_view(camera, pose, self.robot.joints.len()))
+                .map(|pose| match self.coverage(camera, pose) {
+                    share if (0.06..0.17).contains(&share) => 1.0,
+                    _ => -1.0,
+                })
+                .sum();
             if score > best.0 {
                 best = (score, camera);
             }
         }
-        Ok(Station {
-            camera_from_base: best.1,
-            seed,
-        })
+        best.1
+    }
+
+    /// Whether the robot meets neither itself nor the floor.
+    fn free(&self, poses: &[DAffine3]) -> bool {
+        !self.collision.floor_collision(poses, 0.0) && !self.collision.self_collision(poses)
+    }
+
+    fn seen_from(&self, camera_from_base: DAffine3, poses: &[DAffine3]) -> Vec<DVec3> {
+        let joints = self.robot.joint_origins(poses);
+        let seen = joints.into_iter();
+        seen.map(|j| camera_from_base.transform_point3(j)).collect()
     }
 
     /// A camera that shows the robot at a random size, if the first try keeps the rules.
