@@ -23,25 +23,28 @@ const TEXT: f64 = 16.0;
 /// # Errors
 /// The drawing library's.
 pub fn sheet(headings: &[&str], rows: &[SheetRow]) -> Result<RgbImage, ChartError> {
-    let columns = headings.len() as u32;
-    let step = LINE + CELL.1 + GAP;
-    let width = GAP + columns * (CELL.0 + GAP);
-    let height = LINE + rows.len() as u32 * step + GAP;
-    let mut sheet = RgbImage::from_pixel(width, height, Rgb([255; 3]));
     let left = |column: usize| GAP + column as u32 * (CELL.0 + GAP);
     let mut texts: Vec<(String, [u32; 2])> = headings
         .iter()
         .enumerate()
         .map(|(column, heading)| ((*heading).to_owned(), [left(column), GAP / 2]))
         .collect();
-    for (index, row) in rows.iter().enumerate() {
-        let top = LINE + index as u32 * step;
+    let mut top = LINE;
+    let mut placed = Vec::new();
+    for row in rows {
         texts.push((row.caption.clone(), [GAP, top + GAP / 2]));
-        for (column, picture) in row.pictures.iter().enumerate() {
-            let fitted = fit(picture);
-            let x = left(column) + (CELL.0 - fitted.width()) / 2;
-            imageops::replace(&mut sheet, &fitted, x.into(), (top + LINE).into());
+        top += LINE;
+        let fitted: Vec<RgbImage> = row.pictures.iter().map(fit).collect();
+        let tallest = fitted.iter().map(RgbImage::height).max().unwrap_or(0);
+        for (column, picture) in fitted.into_iter().enumerate() {
+            let x = left(column) + (CELL.0 - picture.width()) / 2;
+            placed.push((picture, x, top));
         }
+        top += tallest + GAP;
+    }
+    let mut sheet = RgbImage::from_pixel(left(headings.len()), top, Rgb([255; 3]));
+    for (picture, x, y) in placed {
+        imageops::replace(&mut sheet, &picture, x.into(), y.into());
     }
     write(&mut sheet, TEXT, &texts)?;
     Ok(sheet)

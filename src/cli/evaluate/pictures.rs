@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use anyhow::{Context, anyhow};
+use anyhow::Context;
 use image::{DynamicImage, GrayImage, RgbImage, RgbaImage};
 
 use super::report::{Report, in_words, status};
@@ -96,34 +96,38 @@ fn training(models: &[Judged]) -> anyhow::Result<Option<RgbImage>> {
     });
     for model in models {
         let curves = &model.model.description.card["curves"];
-        if curves.is_null() {
-            log::warn!(
-                "{}: its card has no curves: they are not drawn",
-                model.file.display()
-            );
-            continue;
-        }
         for (key, scale, chart) in &mut charts {
-            let points: Option<Vec<[f64; 2]>> = serde_json::from_value(curves[&**key].clone()).ok();
-            let mut points = points.filter(|points| !points.is_empty()).ok_or_else(|| {
-                anyhow!(
-                    "{}: card: curves.{key}: expected [[iteration, value], ...], found {}",
-                    model.file.display(),
-                    curves[&**key]
-                )
-            })?;
-            points.iter_mut().for_each(|[_, y]| *y *= *scale);
+            let curve = &curves[&**key];
+            if curve.is_null() {
+                log::warn!(
+                    "{}: its card has no curves.{key}: it is not drawn",
+                    model.file.display()
+                );
+                continue;
+            }
+            let points = serde_json::from_value::<Vec<[f64; 2]>>(curve.clone()).ok();
+            let points = points
+                .filter(|points| !points.is_empty())
+                .with_context(|| {
+                    format!(
+                        "{}: card: curves.{key}: expected [[iteration, value], ...], found {curve}",
+                        model.file.display()
+                    )
+                })?;
             let stem = model.file.file_stem().unwrap_or_default();
             chart.lines.push(Line {
                 name: stem.to_string_lossy().into_owned(),
-                points,
+                points: points.into_iter().map(|[x, y]| [x, *scale * y]).collect(),
             });
         }
     }
-    if charts.iter().any(|(_, _, chart)| chart.lines.is_empty()) {
-        return Ok(None);
-    }
-    Ok(Some(draw::line_charts(&charts.map(|(.., chart)| chart))?))
+    let drawn = charts.into_iter().map(|(.., chart)| chart);
+    let drawn: Vec<LineChart> = drawn.filter(|chart| !chart.lines.is_empty()).collect();
+    Ok(if drawn.is_empty() {
+        None
+    } else {
+        Some(draw::line_charts(&drawn)?)
+    })
 }
 
 fn joint_errors(report: &Report) -> anyhow::Result<RgbImage> {
@@ -292,12 +296,12 @@ fn photos(models: &mut [Judged], photos: &[JudgedPhoto]) -> anyhow::Result<RgbIm
                     status(photo.score.status).replace('_', " ")
                 ),
                 pictures: vec![
+                    DynamicImage::from(image.clone()).into_rgb8(),
                     draw::annotated(&image, &photo.annotation.mask(), &marks),
                     draw::annotated(&image, &estimate, &joints),
-                    DynamicImage::from(image).into_rgb8(),
                 ],
             })
         })
         .collect::<anyhow::Result<Vec<_>>>()?;
-    Ok(draw::sheet(&["truth", "estimate", "photo"], &rows)?)
+    Ok(draw::sheet(&["photo", "truth", "estimate"], &rows)?)
 }
