@@ -492,8 +492,7 @@ impl Bench {
 }
 
 fn add_robot(line: &mut Value, joints: &[[f64; 3]], pixel: impl Fn([f64; 3]) -> [f64; 2]) {
-    let mut identity = [0.0; 16];
-    [0, 5, 10, 15].map(|i| identity[i] = 1.0);
+    let identity: [f64; 16] = std::array::from_fn(|i| f64::from(u8::from(i % 5 == 0)));
     line["camera_from_base"] = json!(identity);
     line["joint_angles_rad"] = json!(vec![0.0; 6]);
     line["joints_m"] = json!(joints);
