@@ -1,6 +1,6 @@
-// Copies the channels of one input to their place among those of several.
-// Activations are [image][channel / 4][row][column] of vec4, seen here as scalars: channels of two
-// inputs may share a vec4.
+// Copies the channels of one input to their place among those of several, a block of four at a
+// time. Inputs are copied in their order: what a block holds beyond its input's last channel, the
+// next input overwrites. Activations are [image][channel / 4][row][column] of vec4.
 
 // Rows times columns.
 override PLANE: u32;
@@ -11,14 +11,14 @@ override FIRST: u32;
 override OUT_BLOCKS: u32;
 
 override IN_BLOCKS: u32 = (CHANNELS + 3u) / 4u;
-override INVOCATIONS: u32 = BATCH * CHANNELS * PLANE;
+// Lanes of the first block that belong to earlier inputs.
+override SHIFT: u32 = FIRST % 4u;
+// Blocks of the output that the input reaches.
+override BLOCKS: u32 = (SHIFT + CHANNELS + 3u) / 4u;
+override INVOCATIONS: u32 = BATCH * BLOCKS * PLANE;
 
-@group(0) @binding(0) var<storage, read> input: array<f32>;
-@group(0) @binding(1) var<storage, read_write> output: array<f32>;
-
-fn place(image: u32, blocks: u32, channel: u32, pixel: u32) -> u32 {
-    return (((image * blocks + channel / 4u) * PLANE) + pixel) * 4u + channel % 4u;
-}
+@group(0) @binding(0) var<storage, read> input: array<vec4<f32>>;
+@group(0) @binding(1) var<storage, read_write> output: array<vec4<f32>>;
 
 @compute @workgroup_size(64)
 fn main(
@@ -31,8 +31,21 @@ fn main(
         return;
     }
     let pixel = index % PLANE;
-    let channel = index / PLANE % CHANNELS;
-    let image = index / (PLANE * CHANNELS);
-    output[place(image, OUT_BLOCKS, FIRST + channel, pixel)]
-        = input[place(image, IN_BLOCKS, channel, pixel)];
+    let block = index / PLANE % BLOCKS;
+    let image = index / (PLANE * BLOCKS);
+    let source = image * IN_BLOCKS * PLANE + pixel;
+    let place = (image * OUT_BLOCKS + FIRST / 4u + block) * PLANE + pixel;
+    if SHIFT == 0u {
+        output[place] = input[source + block * PLANE];
+        return;
+    }
+    var texel = output[place];
+    for (var lane = 0u; lane < 4u; lane++) {
+        // Lanes before the input's first channel wrap round to numbers beyond its last.
+        let channel = block * 4u + lane - SHIFT;
+        if channel < CHANNELS {
+            texel[lane] = input[source + channel / 4u * PLANE][channel % 4u];
+        }
+    }
+    output[place] = texel;
 }

@@ -8,7 +8,7 @@ use image::RgbaImage;
 use whereabot::camera::{Camera, Rectification};
 use whereabot::cascade::{Estimate, Locator, Output, Status};
 use whereabot::gpu::{Frame, GpuError, Plan};
-use whereabot::network::Model;
+use whereabot::network::{Layer, Model, Network, Operation};
 
 const ALL: Output = Output {
     mask: true,
@@ -151,7 +151,7 @@ fn constant(value: f32, joint: f32) -> Model {
     let description = description(48, 40, 4);
     let bytes = model_file(&description, 1);
     let mut model = Model::from_bytes(&bytes, "constant").unwrap();
-    let fill = |network: &whereabot::network::Network, input: &str, last: f32| {
+    let fill = |network: &Network, input: &str, last: f32| {
         let layers: Vec<_> = network.nodes().iter().map(|n| n.layer.clone()).collect();
         let count_with_parameters = network
             .nodes()
@@ -159,7 +159,7 @@ fn constant(value: f32, joint: f32) -> Model {
             .filter(|n| n.parameters.is_some())
             .count();
         let mut index = 0;
-        whereabot::network::Network::new(input, network.input(), layers, |_, weight, bias| {
+        Network::new(input, network.input(), layers, |_, weight, bias| {
             index += 1;
             Ok(whereabot::network::Parameters {
                 weight: vec![0.0; weight.iter().product()],
@@ -180,6 +180,23 @@ fn constant(value: f32, joint: f32) -> Model {
     model
 }
 
+/// The same, with the joint network's values taken for slopes and logarithms of depth.
+fn back_projected(mut model: Model) -> Model {
+    let network = &model.joint_network;
+    let mut layers: Vec<_> = network.nodes().iter().map(|n| n.layer.clone()).collect();
+    layers.push(Layer {
+        name: "joints".into(),
+        inputs: vec![layers.last().unwrap().name.clone()],
+        operation: Operation::BackProject,
+    });
+    let mut parameters = network.nodes().iter().filter_map(|n| n.parameters.clone());
+    model.joint_network = Network::new("overlay", network.input(), layers, |_, _, _| {
+        Ok(parameters.next().unwrap())
+    })
+    .unwrap();
+    model
+}
+
 #[test]
 fn what_is_no_result_is_not_reported_as_one() {
     let camera = Camera::from_hfov(48, 40, 1.2);
@@ -192,6 +209,10 @@ fn what_is_no_result_is_not_reported_as_one() {
         (constant(0.9, -2.0), Status::Invalid),
         (constant(0.9, f32::NAN), Status::Invalid),
         (constant(f32::NAN, 2.0), Status::Invalid),
+        (back_projected(constant(0.9, 0.5)), Status::Found),
+        // A depth beyond f32, and one that rounds to none.
+        (back_projected(constant(0.9, 100.0)), Status::Invalid),
+        (back_projected(constant(0.9, -200.0)), Status::Invalid),
     ];
     for (model, status) in cases {
         for mut locator in [

@@ -11,7 +11,7 @@ use whereabot::gpu::{NetworkPlan, Tensor};
 use whereabot::network::{Model, Network, Shape};
 use whereabot::reference;
 
-const NAMES: [&str; 4] = ["tiny", "threshold", "tiny_f16", "context"];
+const NAMES: [&str; 5] = ["tiny", "threshold", "tiny_f16", "context", "heatmap"];
 
 fn file(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
@@ -61,15 +61,19 @@ fn every_layer_of_the_reference_agrees_with_pytorch() {
 
 #[test]
 fn a_wrong_weight_is_noticed() {
-    for (prefix, source) in [("mask", "image"), ("joint", "overlay")] {
-        let model = model("tiny");
+    for (name, prefix, source) in [
+        ("tiny", "mask", "image"),
+        ("tiny", "joint", "overlay"),
+        ("heatmap", "joint", "overlay"),
+    ] {
+        let model = model(name);
         let network = if prefix == "mask" {
             &model.mask_network
         } else {
             &model.joint_network
         };
         let other = rename_input(network, source);
-        assert!(greatest(&other, "tiny", prefix, source) > 1e-4);
+        assert!(greatest(&other, name, prefix, source) > 1e-4);
     }
 }
 

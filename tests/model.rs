@@ -189,6 +189,89 @@ fn descriptions_that_mean_something_else_are_refused() {
 }
 
 #[test]
+fn layers_that_make_joints_from_heat_maps_check_their_inputs() {
+    let soft_argmax = |inputs: Value, origin: Value, step: Value| {
+        with_description(|d| {
+            d["joint_network"]["layers"] = json!([
+                {"name": "votes", "op": "concat", "inputs": ["overlay", "overlay", "overlay"]},
+                {"name": "small", "op": "max_pool2d", "inputs": ["votes"], "size": 2},
+                {"name": "position", "op": "soft_argmax2d", "inputs": inputs, "origin": origin, "step": step},
+                {"name": "joints", "op": "back_project", "inputs": ["overlay"]},
+            ]);
+        })
+    };
+    let (inputs, origin, step) = (
+        json!(["overlay", "votes"]),
+        json!([-0.7, 0]),
+        json!([1, 0.02]),
+    );
+    let cases: [(Value, Value, Value, &[&str]); 8] = [
+        // A good soft-argmax: the next layer is at fault.
+        (
+            inputs.clone(),
+            origin.clone(),
+            step.clone(),
+            &["joint.joints", "[3 * joints, 1, 1]", "found [3, 16, 24]"],
+        ),
+        (
+            json!(["overlay"]),
+            origin.clone(),
+            step.clone(),
+            &["joint.position", "expected two for soft_argmax2d, found 1"],
+        ),
+        (
+            json!(["overlay", "votes", "votes"]),
+            origin.clone(),
+            step.clone(),
+            &["joint.position", "found 3"],
+        ),
+        (
+            json!(["overlay", "overlay"]),
+            origin.clone(),
+            step.clone(),
+            &["joint.position", "[9, 16, 24]", "found [3, 16, 24]"],
+        ),
+        (
+            json!(["overlay", "small"]),
+            origin.clone(),
+            step.clone(),
+            &["joint.position", "[9, 16, 24]", "found [9, 8, 12]"],
+        ),
+        (
+            inputs.clone(),
+            json!([0, 1e39]),
+            step.clone(),
+            &["joint.position", "origin", "finite", "inf"],
+        ),
+        (
+            inputs.clone(),
+            origin.clone(),
+            json!([0.02, 0]),
+            &["joint.position", "step", "above 0", "[0.02, 0.0]"],
+        ),
+        (
+            inputs.clone(),
+            origin.clone(),
+            json!([1]),
+            &["invalid length 1"],
+        ),
+    ];
+    for (inputs, origin, step, parts) in cases {
+        assert_says(&soft_argmax(inputs, origin, step), parts);
+    }
+    let error = with_description(|d| {
+        d["joint_network"]["layers"] = json!([
+            {"name": "colour", "op": "max_pool2d", "inputs": ["overlay"], "size": 16},
+            {"name": "joints", "op": "back_project", "inputs": ["colour", "colour"]},
+        ]);
+    });
+    assert_says(
+        &error,
+        &["joint.joints", "expected one for back_project, found 2"],
+    );
+}
+
+#[test]
 fn huge_numbers_in_a_description_are_refused_before_anything_is_allocated() {
     let error = with_description(|d| {
         d["joint_network"]["layers"][0]["out_channels"] = json!(u64::MAX / 2);

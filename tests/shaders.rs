@@ -9,7 +9,8 @@ use naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
 use naga::{Module, ShaderStage};
 
 /// One for each file in `shaders/`: a kernel that nobody lists is not tested.
-const KERNELS: [&str; 10] = [
+const KERNELS: [&str; 12] = [
+    "back_project",
     "concat",
     "conv2d",
     "coverage",
@@ -19,6 +20,7 @@ const KERNELS: [&str; 10] = [
     "rectify",
     "render",
     "sigmoid",
+    "soft_argmax2d",
     "upsample2d",
 ];
 

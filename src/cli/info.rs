@@ -112,7 +112,7 @@ fn layers(name: &str, network: &Network) -> String {
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,
-            "  {:10} {:10} {:32} of {:16} {:16} {:>9} MMAC {:>9} parameters",
+            "  {:10} {:13} {:36} of {:16} {:16} {:>9} MMAC {:>9} parameters",
             layer.name,
             layer.operation.name(),
             options(&layer.operation),
@@ -144,7 +144,11 @@ fn options(operation: &Operation) -> String {
             activation: a,
         } => format!("to {out_features}{}", activation(a)),
         Operation::Upsample2d { scale } => format!("x {scale}"),
-        Operation::Sigmoid | Operation::Concat => String::new(),
+        Operation::SoftArgmax2d {
+            origin: [x, y],
+            step: [dx, dy],
+        } => format!("from {x:.3}, {y:.3} by {dx:.3}, {dy:.3}"),
+        Operation::Sigmoid | Operation::Concat | Operation::BackProject => String::new(),
     }
 }
 

@@ -27,7 +27,7 @@ pub(super) fn concat(
                     ("OUT_BLOCKS", blocks(output.shape.channels) as f64),
                 ],
                 (input, output),
-                input.batch * channels * plane,
+                input.batch * (first % 4 + channels).div_ceil(4) * plane,
             );
             first += channels;
             step

@@ -1,6 +1,7 @@
 //! The layers of a network as compute kernels on wgpu.
 
 mod adapter;
+mod back_project;
 mod concat;
 mod conv2d;
 mod coverage;
@@ -13,6 +14,7 @@ mod overlay;
 mod plan;
 mod rectify;
 mod sigmoid;
+mod soft_argmax2d;
 mod step;
 mod tensor;
 mod tier;

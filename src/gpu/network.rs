@@ -1,8 +1,10 @@
+use super::back_project::back_project;
 use super::concat::concat;
 use super::conv2d::conv2d;
 use super::dense::dense;
 use super::max_pool2d::max_pool2d;
 use super::sigmoid::sigmoid;
+use super::soft_argmax2d::soft_argmax2d;
 use super::step::Step;
 use super::tensor::Tensor;
 use super::upsample2d::upsample2d;
@@ -82,6 +84,20 @@ impl NetworkPlan {
                         steps.push(upsample2d(device, &label, source, &output, scale)?);
                     }
                     Operation::Concat => steps.extend(concat(device, &label, &sources, &output)?),
+                    Operation::SoftArgmax2d { origin, step } => {
+                        let votes = sources.get(1).copied().unwrap_or(input);
+                        steps.push(soft_argmax2d(
+                            device,
+                            &label,
+                            (source, votes),
+                            &output,
+                            origin,
+                            step,
+                        )?);
+                    }
+                    Operation::BackProject => {
+                        steps.push(back_project(device, &label, source, &output)?);
+                    }
                 }
                 outputs.push(output);
             }

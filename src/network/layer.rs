@@ -16,7 +16,7 @@ pub enum Activation {
 }
 
 /// What a layer computes. Weights are laid out as PyTorch has them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Operation {
     /// Cross-correlation with stride 1 and zero padding 'same'; weight `[out, in, kernel, kernel]`,
     /// bias `[out]`.
@@ -53,6 +53,20 @@ pub enum Operation {
     },
     /// The channels of two or more inputs of one height and width, one after the other.
     Concat,
+    /// Where the cells of heat maps vote for, on average (Sun et al. 2018, "Integral Human Pose
+    /// Regression"). Inputs: logits `[joints, height, width]` and votes
+    /// `[3 * joints, height, width]`; output `[3 * joints, 1, 1]`. With the softmax of a joint's
+    /// logits over its cells as weights, its three values are the means of
+    /// `origin + step * (column, row)` plus its first two votes, and of its third vote.
+    SoftArgmax2d {
+        /// Place of cell (0, 0), as x, y.
+        origin: [f32; 2],
+        /// Distance from column to column and from row to row, positive.
+        step: [f32; 2],
+    },
+    /// From `(x / z, y / z, ln z)` to the point `(x, y, z)`, joint by joint, over
+    /// `[3 * joints, 1, 1]`.
+    BackProject,
 }
 
 impl Operation {
@@ -65,28 +79,25 @@ impl Operation {
             Self::Sigmoid => "sigmoid",
             Self::Upsample2d { .. } => "upsample2d",
             Self::Concat => "concat",
+            Self::SoftArgmax2d { .. } => "soft_argmax2d",
+            Self::BackProject => "back_project",
         }
     }
 
     /// The output's shape for inputs of these shapes, or what is wrong with the operation.
     pub(super) fn output_shape(&self, inputs: &[Shape]) -> Result<Shape, String> {
-        let (&input, others) = match (self, inputs) {
-            (Self::Concat, [first, others @ ..]) if !others.is_empty() => (first, others),
-            (Self::Concat, _) => {
-                return Err(format!(
-                    "inputs: expected two or more for concat, found {}",
-                    inputs.len()
-                ));
-            }
-            (_, [input]) => (input, &[][..]),
-            _ => {
-                return Err(format!(
-                    "inputs: expected one for {}, found {}",
-                    self.name(),
-                    inputs.len()
-                ));
-            }
+        let (enough, count) = match self {
+            Self::Concat => (inputs.len() >= 2, "two or more"),
+            Self::SoftArgmax2d { .. } => (inputs.len() == 2, "two"),
+            _ => (inputs.len() == 1, "one"),
         };
+        let (&input, others) = inputs.split_first().filter(|_| enough).ok_or_else(|| {
+            format!(
+                "inputs: expected {count} for {}, found {}",
+                self.name(),
+                inputs.len()
+            )
+        })?;
         let positive = |what: &str, value: usize| {
             if value == 0 {
                 Err(format!("{what}: expected at least 1, found 0"))
@@ -161,6 +172,34 @@ impl Operation {
                 }
                 Ok(Shape::new(channels, input.height, input.width))
             }
+            Self::SoftArgmax2d { origin, step } => {
+                if origin.iter().any(|v| !v.is_finite()) {
+                    return Err(format!("origin: expected finite numbers, found {origin:?}"));
+                }
+                if step.iter().any(|v| !(v.is_finite() && *v > 0.0)) {
+                    return Err(format!(
+                        "step: expected finite numbers above 0, found {step:?}"
+                    ));
+                }
+                let wanted = Shape {
+                    channels: input.channels.saturating_mul(3),
+                    ..input
+                };
+                if let Some(votes) = others.iter().find(|votes| **votes != wanted) {
+                    return Err(format!(
+                        "inputs: expected votes of shape {wanted} for heat maps of shape {input}, found {votes}"
+                    ));
+                }
+                Ok(Shape::new(wanted.channels, 1, 1))
+            }
+            Self::BackProject => {
+                if !input.channels.is_multiple_of(3) || (input.height, input.width) != (1, 1) {
+                    return Err(format!(
+                        "inputs: expected a shape [3 * joints, 1, 1], found {input}"
+                    ));
+                }
+                Ok(input)
+            }
         }
     }
 
@@ -179,7 +218,12 @@ impl Operation {
             Self::Dense { out_features, .. } => {
                 Some((vec![out_features, input.len()], vec![out_features]))
             }
-            Self::MaxPool2d { .. } | Self::Sigmoid | Self::Upsample2d { .. } | Self::Concat => None,
+            Self::MaxPool2d { .. }
+            | Self::Sigmoid
+            | Self::Upsample2d { .. }
+            | Self::Concat
+            | Self::SoftArgmax2d { .. }
+            | Self::BackProject => None,
         }
     }
 
@@ -192,13 +236,18 @@ impl Operation {
                 ..
             } => (input.len() * out_channels * kernel * kernel) as u64,
             Self::Dense { out_features, .. } => (input.len() * out_features) as u64,
-            Self::MaxPool2d { .. } | Self::Sigmoid | Self::Upsample2d { .. } | Self::Concat => 0,
+            Self::MaxPool2d { .. }
+            | Self::Sigmoid
+            | Self::Upsample2d { .. }
+            | Self::Concat
+            | Self::SoftArgmax2d { .. }
+            | Self::BackProject => 0,
         }
     }
 }
 
 /// A layer: a name, the names of what it reads, and its operation.
-#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(from = "LayerRecord")]
 pub struct Layer {
     /// Unique within the network; part of its tensors' names.
@@ -249,6 +298,17 @@ enum LayerRecord {
         name: String,
         inputs: Vec<String>,
     },
+    #[serde(rename = "soft_argmax2d")]
+    SoftArgmax2d {
+        name: String,
+        inputs: Vec<String>,
+        origin: [f32; 2],
+        step: [f32; 2],
+    },
+    BackProject {
+        name: String,
+        inputs: Vec<String>,
+    },
 }
 
 impl From<LayerRecord> for Layer {
@@ -294,6 +354,13 @@ impl From<LayerRecord> for Layer {
                 scale,
             } => (name, inputs, Operation::Upsample2d { scale }),
             LayerRecord::Concat { name, inputs } => (name, inputs, Operation::Concat),
+            LayerRecord::SoftArgmax2d {
+                name,
+                inputs,
+                origin,
+                step,
+            } => (name, inputs, Operation::SoftArgmax2d { origin, step }),
+            LayerRecord::BackProject { name, inputs } => (name, inputs, Operation::BackProject),
         };
         Self {
             name,

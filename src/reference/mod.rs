@@ -3,6 +3,7 @@
 //!
 //! Activations are `[channel, row, column]`, as PyTorch has them, for one image.
 
+mod back_project;
 mod concat;
 mod conv2d;
 mod coverage;
@@ -12,8 +13,10 @@ mod network;
 mod overlay;
 mod rectify;
 mod sigmoid;
+mod soft_argmax2d;
 mod upsample2d;
 
+pub use back_project::back_project;
 pub use concat::concat;
 pub use conv2d::conv2d;
 pub use coverage::coverage;
@@ -23,6 +26,7 @@ pub use network::{run, run_all};
 pub use overlay::overlay;
 pub use rectify::rectify;
 pub use sigmoid::sigmoid;
+pub use soft_argmax2d::soft_argmax2d;
 pub use upsample2d::upsample2d;
 
 use crate::network::{Activation, Shape};

@@ -1,4 +1,6 @@
-use super::{Tensor, concat, conv2d, dense, max_pool2d, sigmoid, upsample2d};
+use super::{
+    Tensor, back_project, concat, conv2d, dense, max_pool2d, sigmoid, soft_argmax2d, upsample2d,
+};
 use crate::network::{Network, Operation, Source};
 
 /// The output of `network` for `input`, whose shape must be the network's; `None` where it is not.
@@ -42,6 +44,10 @@ pub fn run_all(network: &Network, input: &Tensor) -> Option<Vec<Tensor>> {
             Operation::Sigmoid => sigmoid(source),
             Operation::Upsample2d { scale } => upsample2d(source, scale),
             Operation::Concat => concat(&sources),
+            Operation::SoftArgmax2d { origin, step } => {
+                soft_argmax2d(source, sources.get(1)?, origin, step)
+            }
+            Operation::BackProject => back_project(source),
         };
         outputs.push(output);
     }

@@ -125,7 +125,7 @@ def test_committed_golden_files_are_what_pytorch_computes(tmp_path, request):
     committed = request.config.rootpath.parent / "tests" / "data" / "golden"
     golden.write_golden(tmp_path)
     names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == sorted(path.name for path in committed.iterdir()) and len(names) == 8
+    assert names == sorted(path.name for path in committed.iterdir()) and len(names) == 10
     for name in names:
         made, kept = load_file(tmp_path / name), load_file(committed / name)
         assert made.keys() == kept.keys()

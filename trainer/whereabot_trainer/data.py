@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from filelock import FileLock
 from PIL import Image, ImageOps
 from tqdm import tqdm
 
@@ -99,6 +100,12 @@ def _cached_pixels(folder, samples, cache):
     folder, cache = Path(folder).resolve(), Path(cache)
     cache.mkdir(parents=True, exist_ok=True)
     stem = f"{folder.name}-{hashlib.sha256(str(folder).encode()).hexdigest()[:8]}"
+    # Two trainings may start at once.
+    with FileLock(cache / f"{stem}.lock"):
+        return _locked_pixels(folder, samples, cache, stem)
+
+
+def _locked_pixels(folder, samples, cache, stem):
     index = cache / f"{stem}.json"
 
     def digest(count):

@@ -59,14 +59,32 @@ CONTEXT_LAYERS = [
      "activation": "none"},
     {"name": "mask", "op": "sigmoid", "inputs": ["logit"]},
 ]
+# 7 rows and 10 columns of cells, sharp enough for a place to show; joints and hidden features share a block of four.
+HEATMAP_LAYERS = [
+    {"name": "conv1", "op": "conv2d", "inputs": ["overlay"], "out_channels": 5, "kernel": 3, "dilation": 2,
+     "activation": "relu"},
+    {"name": "pool1", "op": "max_pool2d", "inputs": ["conv1"], "size": 2},
+    {"name": "conv2", "op": "conv2d", "inputs": ["pool1"], "out_channels": 7, "kernel": 3, "dilation": 1,
+     "activation": "relu"},
+    {"name": "heat", "op": "conv2d", "inputs": ["conv2"], "out_channels": len(JOINTS), "kernel": 3, "dilation": 1,
+     "activation": "none"},
+    {"name": "votes", "op": "conv2d", "inputs": ["conv2"], "out_channels": 3 * len(JOINTS), "kernel": 1, "dilation": 1,
+     "activation": "none"},
+    {"name": "place", "op": "soft_argmax2d", "inputs": ["heat", "votes"], "origin": [-0.625, -0.4],
+     "step": [0.14, 0.13]},
+    {"name": "hidden", "op": "dense", "inputs": ["place"], "out_features": 9, "activation": "relu"},
+    {"name": "places", "op": "concat", "inputs": ["place", "hidden"]},
+    {"name": "dense", "op": "dense", "inputs": ["places"], "out_features": 3 * len(JOINTS), "activation": "none"},
+    {"name": "joints", "op": "back_project", "inputs": ["dense"]},
+]
 CARD = {"data": "none: random weights", "purpose": "golden files of whereabot's tests"}
 
 
-def _networks(seed, image, mask_layers):
+def _networks(seed, image, mask_layers, joint_layers):
     torch.manual_seed(seed)
     shape = tuple(image.shape)
     mask = Network(mask_layers, MASK_INPUT, shape)
-    joint = Network(JOINT_LAYERS, JOINT_INPUT, shape)
+    joint = Network(joint_layers, JOINT_INPUT, shape)
     # Default weights give a mask that is nearly the same all over, and a dead first layer behind it: spread the values
     # and centre the mask on 0.5, so that a wrong layer shows.
     with torch.no_grad():
@@ -82,7 +100,11 @@ def _networks(seed, image, mask_layers):
         joint.conv1.weight *= 3
         joint.conv1.bias += 0.2
         joint.conv2.weight *= 3
-        joint.conv3.weight *= 3
+        if hasattr(joint, "heat"):
+            # A flat heat map would hide a wrong place.
+            joint.heat.weight *= 20
+        else:
+            joint.conv3.weight *= 3
         joint.dense.bias[2::3] += 1.5
     return mask, joint
 
@@ -100,21 +122,24 @@ def cascade_activations(mask, joint, rule, image):
 
 
 def write_golden(folder, seed=1):
-    """Writes the models `tiny`, `threshold`, `tiny_f16` and `context` with their activations."""
+    """Writes the models `tiny`, `threshold`, `tiny_f16`, `context` and `heatmap` with their activations."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     torch.use_deterministic_algorithms(True)
     torch.set_num_threads(1)
     multiply, threshold = {"rule": "multiply"}, {"rule": "threshold", "threshold": 0.5}
-    paper, context = (MASK_LAYERS, WIDTH, HEIGHT), (CONTEXT_LAYERS, CONTEXT_WIDTH, CONTEXT_HEIGHT)
-    for name, family, (layers, width, height), rule, dtype in (
+    paper = (MASK_LAYERS, JOINT_LAYERS, WIDTH, HEIGHT)
+    context = (CONTEXT_LAYERS, JOINT_LAYERS, CONTEXT_WIDTH, CONTEXT_HEIGHT)
+    heatmap = (MASK_LAYERS, HEATMAP_LAYERS, WIDTH, HEIGHT)
+    for name, family, (mask_layers, joint_layers, width, height), rule, dtype in (
         ("tiny", "paper", paper, multiply, "f32"), ("threshold", "paper", paper, threshold, "f32"),
         ("tiny_f16", "paper", paper, multiply, "f16"), ("context", "context", context, multiply, "f32"),
+        ("heatmap", "context", heatmap, multiply, "f32"),
     ):
         image = torch.rand((3, height, width), generator=torch.Generator().manual_seed(seed))
-        mask, joint = _networks(seed, image, layers)
+        mask, joint = _networks(seed, image, mask_layers, joint_layers)
         description = describe(
-            layers, JOINT_LAYERS, family=family, robot="golden", overlay=rule, width=width, height=height,
+            mask_layers, joint_layers, family=family, robot="golden", overlay=rule, width=width, height=height,
             camera={"fx": 14.25, "fy": 14.25, "cx": (width - 1) / 2, "cy": (height - 1) / 2},
             presence={"mask_threshold": 0.5, "sure_threshold": 0.7, "min_sure": 0.01}, card=CARD)
         path = folder / f"{name}.safetensors"
