@@ -877,3 +877,34 @@ fn a_models_card_is_shown() {
     assert_eq!(code, 1);
     assert!(message.contains("missing.safetensors"), "{message}");
 }
+
+#[test]
+fn the_papers_recordings_want_three_robots_and_no_other_choice() {
+    let bench = Bench::new();
+    let paper = "record --paper --backgrounds photos --seed 1 --out out";
+    let one = "record --backgrounds photos --seed 1 --out out --urdf a.urdf";
+    let three = "--urdf ur3=a --urdf ur5=b --urdf ur10=c";
+    for (arguments, told) in [
+        (format!("{paper} --urdf ur3=a --urdf ur5=b"), "ur10=FILE"),
+        (format!("{paper} {three} --urdf ur3=d"), "twice"),
+        (format!("{paper} {three} --urdf d"), "found d"),
+        (format!("{paper} --urdf ur7=a"), "found ur7=a"),
+        (paper.to_owned(), "--urdf"),
+        (format!("{paper} {three} --samples 5"), "--samples"),
+        (format!("{paper} {three} --robot ur5"), "--robot"),
+        (format!("{paper} {three} --free-camera"), "--free-camera"),
+        (format!("{one} --robot arm"), "--samples"),
+        (format!("{one} --samples 5"), "--robot"),
+        (format!("{one} --samples 5 --robot arm --urdf b"), "found 2"),
+    ] {
+        let arguments: Vec<&str> = arguments.split(' ').collect();
+        let (code, stderr) = bench.fail(&arguments);
+        assert_eq!(code, 2, "{arguments:?}");
+        assert!(stderr.contains(told), "{stderr}");
+    }
+    // The first robot is looked at before anything is drawn.
+    let arguments = format!("{paper} {three}");
+    let (code, stderr) = bench.fail(&arguments.split(' ').collect::<Vec<_>>());
+    assert!(code == 1 && stderr.contains("a: "), "{stderr}");
+    assert!(!bench.path("out").exists());
+}

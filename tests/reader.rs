@@ -342,3 +342,156 @@ fn a_wrong_picture_is_named() {
     assert!(reader.image(&reader.samples()[1]).is_ok());
     assert!(reader.mask(&reader.samples()[1]).is_ok());
 }
+
+#[cfg(feature = "cli")]
+mod check {
+    use assert_cmd::Command;
+    use image::GenericImageView;
+    use std::process::Output;
+
+    use super::*;
+
+    fn run(arguments: &[&str], folder: &Folder) -> Output {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_whereabot"));
+        command.current_dir(folder.0.path());
+        command.args(["recording", "check"]).args(arguments);
+        command.output().unwrap()
+    }
+
+    fn text(bytes: &[u8]) -> &str {
+        str::from_utf8(bytes).unwrap()
+    }
+
+    #[test]
+    fn a_good_recording_passes() {
+        let folder = Folder::new();
+        let output = run(&["."], &folder);
+        assert_eq!(output.status.code(), Some(0));
+        assert!(output.stderr.is_empty(), "{}", text(&output.stderr));
+        let found = text(&output.stdout);
+        for told in [
+            "arm, real, 16 x 12",
+            "samples     3: 1 to train, 2 to test with",
+            "with robot  2",
+            "25.0 % to 25.0 %",
+            "0 % of these are within 6 % to 17 %",
+            "1.08 m to 2.01 m",
+            "faults      none",
+        ] {
+            assert!(found.contains(told), "{told}: {found}");
+        }
+
+        let output = run(&[".", "--json"], &folder);
+        let line: Value = serde_json::from_slice(&output.stdout).unwrap();
+        assert_eq!(line["schema"], 1);
+        assert_eq!(
+            (&line["samples"], &line["train"], &line["test"]),
+            (&json!(3), &json!(1), &json!(2))
+        );
+        assert_eq!(line["coverage"]["median"], 0.25);
+        assert_eq!(line["faults"], json!([]));
+    }
+
+    #[test]
+    fn all_faults_are_told_with_file_and_line() {
+        let folder = Folder::new();
+        folder.write_lines(&[
+            sample(0),
+            with(sample(1), "/joints_m/1/2", Some(json!(-1.0))),
+            empty(2),
+        ]);
+        fs::remove_file(folder.path("mask/0.png")).unwrap();
+        fs::write(folder.path("image/0.jpg"), "no picture").unwrap();
+        RgbImage::new(3, 3)
+            .save(folder.path("image/2.jpg"))
+            .unwrap();
+        let output = run(&["."], &folder);
+        assert_eq!(output.status.code(), Some(1));
+        let told = text(&output.stderr);
+        let starts = [
+            "error: ./samples.jsonl:1: image/0.jpg: ",
+            "error: ./samples.jsonl:1: mask/0.png: ",
+            "error: ./samples.jsonl:2: joints_m: lift: ",
+            "error: ./samples.jsonl:3: image/2.jpg: expected 16 x 12 pixels, found 3 x 3",
+        ];
+        assert_eq!(told.lines().count(), starts.len(), "{told}");
+        for (line, start) in told.lines().zip(starts) {
+            assert!(line.starts_with(start), "{told}");
+        }
+        assert!(text(&output.stdout).contains("faults      4"));
+        let line: Value = serde_json::from_slice(&run(&[".", "--json"], &folder).stdout).unwrap();
+        assert_eq!(line["fault_count"], 4);
+        assert_eq!(line["faults"].as_array().unwrap().len(), 4);
+
+        let wrong = (0..50).map(|id| with(sample(id), "/coverage", Some(json!(2.0))));
+        folder.write_lines(&wrong.collect::<Vec<_>>());
+        let output = run(&["."], &folder);
+        let told = text(&output.stderr);
+        assert!(
+            told.lines().count() == 21 && told.contains("and 30 more"),
+            "{told}"
+        );
+    }
+
+    #[test]
+    fn what_is_no_whole_recording_fails() {
+        let folder = Folder::new();
+        let fails = |told: &str| {
+            let output = run(&["."], &folder);
+            assert_eq!(output.status.code(), Some(1));
+            assert!(
+                text(&output.stderr).contains(told),
+                "{}",
+                text(&output.stderr)
+            );
+        };
+        let lines = fs::read(folder.path("samples.jsonl")).unwrap();
+        fs::write(folder.path("samples.jsonl"), &lines[..lines.len() - 1]).unwrap();
+        fails("samples.jsonl:3: expected a whole line");
+        fs::write(folder.path("samples.jsonl"), "").unwrap();
+        fails("samples.jsonl: expected at least one sample, found none");
+        fs::write(folder.path("samples.jsonl"), lines).unwrap();
+        folder.write_header(&with(header(), "/source/planned", Some(json!(4))));
+        fails("recording.json: source.planned: expected 4 samples, found 3 good ones");
+        folder.write_header(&with(header(), "/source/planned", Some(json!(3))));
+        assert_eq!(run(&["."], &folder).status.code(), Some(0));
+        fs::remove_dir_all(folder.path("image")).unwrap();
+        fails("samples.jsonl:1: image/0.jpg: ");
+        fs::remove_file(folder.path("recording.json")).unwrap();
+        fails("recording.json: ");
+        assert_eq!(run(&[], &folder).status.code(), Some(2));
+    }
+
+    #[test]
+    fn a_contact_sheet_is_drawn_and_kept() {
+        let folder = Folder::new();
+        let sheet = folder.path("sheet");
+        assert_eq!(
+            run(&[".", "--sheet", "sheet"], &folder).status.code(),
+            Some(0)
+        );
+        let bytes = fs::read(&sheet).unwrap();
+        let picture = image::load_from_memory(&bytes).unwrap();
+        assert_eq!(picture.dimensions(), (6 * 256, 192));
+        // The mask's tint on the left of the first picture, no robot in the third, no fourth.
+        let green = |x, y| {
+            let [r, g, _, _] = picture.get_pixel(x, y).0;
+            g > r.saturating_add(40)
+        };
+        assert!(green(20, 20) && !green(200, 20) && !green(2 * 256 + 20, 20));
+        assert_eq!(picture.get_pixel(3 * 256 + 20, 20).0[..3], [0; 3]);
+
+        fs::write(&sheet, "mine").unwrap();
+        let output = run(&[".", "--sheet", "sheet"], &folder);
+        assert_eq!(output.status.code(), Some(1));
+        assert!(text(&output.stderr).contains("--force"));
+        assert_eq!(fs::read(&sheet).unwrap(), b"mine");
+        assert_eq!(
+            run(&[".", "--sheet", "sheet", "--force"], &folder)
+                .status
+                .code(),
+            Some(0)
+        );
+        assert_eq!(fs::read(&sheet).unwrap(), bytes);
+    }
+}

@@ -11,7 +11,8 @@ use glam::{DAffine3, DVec3};
 use tempfile::TempDir;
 use whereabot::recording::{
     CollisionModel, HEIGHT, Header, INTRINSICS, Item, Kind, Lamp, Lighting, Material, Mesh,
-    Protocol, RecordingError, Renderer, Request, Robot, Sample, Scene, WIDTH, record,
+    Protocol, Reader, RecordingError, Renderer, Request, Robot, Sample, Scene, WIDTH, Writer,
+    paper_requests, record,
 };
 
 fn arm_urdf() -> PathBuf {
@@ -562,17 +563,115 @@ fn the_same_seed_gives_the_same_recording_even_after_a_stop() {
 fn a_fixed_camera_stays_where_it_is() {
     let folder = TempDir::new().unwrap();
     backgrounds(folder.path());
+    let device = common::device();
     let mut request = request(folder.path(), "out");
     request.protocol = Protocol::FixedCamera;
-    record(&common::device(), &request, |_| {}).unwrap();
-    let samples = samples(&request.out);
-    assert_eq!(samples.len(), 6);
-    let first = &samples[0];
-    for sample in &samples[1..] {
+    request.samples = 20;
+    record(&device, &request, |_| {}).unwrap();
+    let reader = Reader::open(&request.out).unwrap();
+    assert_eq!(reader.header().source.planned, Some(20));
+    let first = &reader.samples()[0];
+    let mut angles: Vec<Vec<f64>> = Vec::new();
+    for sample in reader.samples() {
         assert!(sample.camera_from_base.is_some());
         assert_eq!(sample.camera_from_base, first.camera_from_base);
-        assert_ne!(sample.joint_angles_rad, first.joint_angles_rad);
+        for &[u, v] in sample.joints_px.as_ref().unwrap() {
+            assert!((0.0..512.0).contains(&u) && (0.0..424.0).contains(&v));
+        }
+        angles.push(sample.joint_angles_rad.clone().unwrap());
     }
+    // Joints stand on few steps each, in many combinations.
+    for joint in 0..3 {
+        let mut values: Vec<f64> = angles.iter().map(|a| a[joint]).collect();
+        values.sort_by(f64::total_cmp);
+        values.dedup_by(|a, b| (*a - *b).abs() < 1e-9);
+        assert!((2..20).contains(&values.len()), "joint {joint}: {values:?}");
+    }
+    angles.sort_by(|a, b| a.partial_cmp(b).unwrap());
+    angles.dedup();
+    assert_eq!(angles.len(), 20);
+
+    // The photo behind the robot changes, and so does the light.
+    let picture = |sample| reader.image(sample).unwrap();
+    let (one, two) = (picture(first), picture(&reader.samples()[1]));
+    let differ = one.pixels().zip(two.pixels()).filter(|(a, b)| a != b);
+    assert!(differ.count() > 100_000);
+
+    let mut other = request.clone();
+    other.out = folder.path().join("other");
+    other.seed += 1;
+    other.samples = 2;
+    record(&device, &other, |_| {}).unwrap();
+    let other = Reader::open(&other.out).unwrap();
+    assert_ne!(other.samples()[0].camera_from_base, first.camera_from_base);
+}
+
+#[test]
+fn a_fixed_camera_needs_poses_it_can_see() {
+    let folder = TempDir::new().unwrap();
+    backgrounds(folder.path());
+    let text = fs::read_to_string(arm_urdf()).unwrap();
+    // An arm whose joints cannot turn has one pose.
+    let stiff = ["-3.1", "-1.6", "-3"].iter().zip(["3.1", "1.6", "3"]);
+    let stiff = stiff.fold(text.clone(), |text, (lower, upper)| {
+        let range = format!("lower=\"{lower}\" upper=\"{upper}\"");
+        assert!(text.contains(&range));
+        text.replace(&range, "lower=\"0.1\" upper=\"0.1\"")
+    });
+    let mut request = request(folder.path(), "out");
+    request.urdf = folder.path().join("arm.urdf");
+    request.protocol = Protocol::FixedCamera;
+    request.samples = 2;
+    fs::write(&request.urdf, stiff).unwrap();
+    let error = record(&common::device(), &request, |_| {}).unwrap_err();
+    assert!(
+        matches!(error, RecordingError::TooFewPoses { wanted: 2, .. }),
+        "{error}"
+    );
+    assert!(!request.out.exists());
+    fs::write(&request.urdf, text).unwrap();
+    record(&common::device(), &request, |_| {}).unwrap();
+}
+
+#[test]
+fn the_papers_recordings_are_nine() {
+    let urdfs = ["a", "b", "c"].map(PathBuf::from);
+    let requests = |seed| {
+        paper_requests(
+            urdfs.clone(),
+            &[],
+            Path::new("photos"),
+            seed,
+            Path::new("out"),
+        )
+    };
+    let nine = requests(1);
+    let found: Vec<(&str, &str, u64)> = nine
+        .iter()
+        .map(|r| (r.out.to_str().unwrap(), r.urdf.to_str().unwrap(), r.samples))
+        .collect();
+    let expected = [
+        ("out/ur3_1", "a", 211),
+        ("out/ur3_2", "a", 252),
+        ("out/ur3_3", "a", 463),
+        ("out/ur5_1", "b", 252),
+        ("out/ur5_2", "b", 756),
+        ("out/ur5_3", "b", 1512),
+        ("out/ur10_1", "c", 112),
+        ("out/ur10_2", "c", 278),
+        ("out/ur10_3", "c", 514),
+    ];
+    assert_eq!(found, expected);
+    assert!(nine.iter().all(|r| r.protocol == Protocol::FixedCamera));
+    let folder_of = |r: &Request| r.out.file_name().unwrap().to_str().unwrap().to_owned();
+    assert!(
+        nine.iter()
+            .all(|r| folder_of(r).starts_with(&format!("{}_", r.robot)))
+    );
+    let mut seeds: Vec<u64> = nine.iter().chain(&requests(2)).map(|r| r.seed).collect();
+    seeds.sort_unstable();
+    seeds.dedup();
+    assert_eq!(seeds.len(), 18);
 }
 
 #[test]
@@ -583,29 +682,83 @@ fn another_recording_is_not_overwritten() {
     let mut request = request(folder.path(), "out");
     request.samples = 1;
     record(&device, &request, |_| {}).unwrap();
-    let lines = request.out.join("samples.jsonl");
-    let before = fs::read(&lines).unwrap();
+    let (header, lines) = ("recording.json", "samples.jsonl");
+    let (header, lines) = (request.out.join(header), request.out.join(lines));
+    let before = (fs::read(&header).unwrap(), fs::read(&lines).unwrap());
+    let refused = |request: &Request, told: &str| {
+        let error = record(&device, request, |_| {}).unwrap_err().to_string();
+        assert!(error.contains(told), "{error}");
+    };
 
     let mut other = request.clone();
     other.seed = 99;
-    let error = record(&device, &other, |_| {}).unwrap_err();
-    assert!(
-        matches!(error, RecordingError::OutputTaken { .. }),
-        "{error}"
+    refused(
+        &other,
+        "recording.json: holds another recording (source.seed: expected 99, found 3)",
     );
-    assert!(error.to_string().contains("recording.json"), "{error}");
-    assert_eq!(fs::read(&lines).unwrap(), before);
+    let mut other = request.clone();
+    other.robot = "leg".into();
+    refused(
+        &other,
+        "recording.json: holds another recording (robot: expected \"leg\", found \"arm\")",
+    );
+    let mut other = request.clone();
+    other.protocol = Protocol::FixedCamera;
+    refused(
+        &other,
+        "(source.protocol: expected \"fixed_camera\", found \"free_camera\")",
+    );
+    let mut other = request.clone();
+    other.urdf = folder.path().join("renamed.urdf");
+    fs::copy(arm_urdf(), &other.urdf).unwrap();
+    refused(
+        &other,
+        "(source.urdf: expected \"renamed.urdf\", found \"arm.urdf\")",
+    );
+    let text = fs::read_to_string(arm_urdf()).unwrap();
+    fs::write(&other.urdf, text.replace("\"elbow", "\"knee")).unwrap();
+    refused(
+        &other,
+        "(joints: expected [\"pan\",\"lift\",\"knee\"], found [\"pan\",\"lift\",\"elbow\"])",
+    );
+    assert_eq!(
+        (fs::read(&header).unwrap(), fs::read(&lines).unwrap()),
+        before
+    );
+
+    let text = fs::read_to_string(&header).unwrap();
+    fs::write(&header, text.replace("\"version\": 1", "\"version\": 2")).unwrap();
+    refused(&request, "recording.json: version: expected 1, found 2");
+    fs::write(&header, text).unwrap();
 
     fs::write(&lines, "{\"id\":7}\n").unwrap();
-    let error = record(&device, &request, |_| {}).unwrap_err();
-    assert!(error.to_string().contains("samples.jsonl:1: "), "{error}");
-
-    fs::remove_file(request.out.join("recording.json")).unwrap();
-    let error = record(&device, &request, |_| {}).unwrap_err();
-    assert!(
-        matches!(error, RecordingError::OutputTaken { .. }),
-        "{error}"
+    refused(&request, "samples.jsonl:1: ");
+    fs::remove_file(&header).unwrap();
+    refused(
+        &request,
+        "samples.jsonl: part of something without a recording.json",
     );
+    fs::remove_file(&lines).unwrap();
+    refused(
+        &request,
+        "image: part of something without a recording.json",
+    );
+    assert!(request.out.join("image/000000.jpg").exists());
+}
+
+#[test]
+fn two_writers_do_not_mix_their_samples() {
+    let folder = TempDir::new().unwrap();
+    backgrounds(folder.path());
+    let mut request = request(folder.path(), "out");
+    request.samples = 1;
+    record(&common::device(), &request, |_| {}).unwrap();
+    let header = Reader::open(&request.out).unwrap().header().clone();
+    let first = Writer::open(&request.out, &header).unwrap();
+    let error = Writer::open(&request.out, &header).err().unwrap();
+    assert!(error.to_string().contains("another process"), "{error}");
+    drop(first);
+    assert_eq!(Writer::open(&request.out, &header).unwrap().next(), 1);
 }
 
 #[test]

@@ -6,6 +6,7 @@ mod info;
 mod locate;
 mod photo;
 mod record;
+mod recording;
 mod weights;
 
 use std::io::{self, Write};
@@ -23,6 +24,8 @@ enum Command {
     Info(info::Args),
     Record(record::Args),
     Evaluate(evaluate::Args),
+    #[command(subcommand)]
+    Recording(recording::Args),
 }
 
 /// Runs the command line of this process. Exit codes: 0 done, 1 failed, 2 wrong usage.
@@ -40,6 +43,7 @@ pub fn main() -> ExitCode {
         Command::Info(args) => info::run(&args),
         Command::Record(args) => record::run(args),
         Command::Evaluate(args) => evaluate::run(&args),
+        Command::Recording(args) => recording::run(&args),
     };
     done.unwrap_or_else(|error| {
         if is_broken_pipe(&error) {

@@ -130,6 +130,11 @@ fn failed(error: impl std::fmt::Display) -> ChartError {
     ChartError(error.to_string())
 }
 
+/// A number on an axis, without the digits that rounding leaves.
+fn label(value: &f64) -> String {
+    ((value * 1e6).round() / 1e6).to_string()
+}
+
 fn line_chart(chart: &LineChart, panel: &Panel<'_>) -> Result<(), ChartError> {
     let points = || chart.lines.iter().flat_map(|line| &line.points);
     let range = |axis: usize| {
@@ -152,6 +157,8 @@ fn line_chart(chart: &LineChart, panel: &Panel<'_>) -> Result<(), ChartError> {
         .bold_line_style(PALE)
         .axis_style(INK)
         .x_labels(5)
+        .x_label_formatter(&label)
+        .y_label_formatter(&label)
         .x_desc(&chart.x)
         .label_style((FONT, TEXT).into_font().color(&INK))
         .draw()
@@ -195,6 +202,7 @@ fn bar_chart(chart: &BarChart, panel: &Panel<'_>) -> Result<(), ChartError> {
         .bold_line_style(PALE)
         .axis_style(INK)
         .x_labels(0)
+        .y_label_formatter(&label)
         .label_style((FONT, TEXT).into_font().color(&INK))
         .draw()
         .map_err(failed)?;

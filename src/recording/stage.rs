@@ -320,15 +320,18 @@ impl Stage {
         let mut sweep = Sweep::new(&self.robot, samples);
         let mut poses = kept(&sweep);
         while poses.len() < samples {
-            if sweep.len() > POINTS * samples {
+            // A coarse sweep may say little about how many poses a finer one has.
+            let share = (poses.len() as f64 / sweep.len() as f64).max(0.125);
+            let wanted = (samples as f64 / share) as usize;
+            let finer = Sweep::new(&self.robot, wanted.max(sweep.len() + 1));
+            // A robot whose joints cannot turn has no finer sweep.
+            if sweep.len() > POINTS.saturating_mul(samples) || finer == sweep {
                 return Err(RecordingError::TooFewPoses {
                     wanted: samples,
                     found: poses.len(),
                 });
             }
-            let share = (poses.len() as f64 / sweep.len() as f64).max(0.01);
-            let wanted = (samples as f64 / share) as usize;
-            sweep = Sweep::new(&self.robot, wanted.max(sweep.len() + 1));
+            sweep = finer;
             poses = kept(&sweep);
         }
         log::debug!("{} of {} poses of the sweep kept", poses.len(), sweep.len());

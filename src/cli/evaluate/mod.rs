@@ -48,9 +48,12 @@ pub struct Args {
     /// Folders of photos without the robot: how often is it found all the same?
     #[arg(long, value_name = "DIR", num_args(1..))]
     without: Vec<PathBuf>,
-    /// Draw charts and sheets of pictures into this folder, which must be new or empty
+    /// Draw charts and sheets of pictures (PNG) into this folder
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
+    /// Draw into a folder that holds files, and overwrite those of the same name
+    #[arg(long, requires = "plots")]
+    force: bool,
     /// One JSON object instead of tables
     #[arg(long)]
     json: bool,
@@ -140,7 +143,7 @@ struct Results {
 /// Runs the command.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if let Some(folder) = &args.plots {
-        new_folder(folder)?;
+        prepare(folder, args.force)?;
     }
     let models = load(args)?;
     // What can be refused is refused before the work.
@@ -217,14 +220,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Nothing is overwritten.
-fn new_folder(folder: &Path) -> anyhow::Result<()> {
+fn prepare(folder: &Path, force: bool) -> anyhow::Result<()> {
     let named = || folder.display().to_string();
     std::fs::create_dir_all(folder).with_context(named)?;
     let mut entries = std::fs::read_dir(folder).with_context(named)?;
     ensure!(
-        entries.next().is_none(),
-        "{}: expected a new or an empty folder, found files in it",
+        force || entries.next().is_none(),
+        "{}: holds files; --force draws into it all the same",
         folder.display()
     );
     Ok(())
