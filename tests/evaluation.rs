@@ -670,6 +670,7 @@ fn a_known_model_gets_the_figures_that_it_earns() {
     let (code, message) = bench.refused(&again);
     assert_eq!(code, 1);
     assert!(message.contains("plots: holds files; --force"), "{message}");
+    bench.json(&["--recording", "a", "--plots", "plots", "--force"]);
 }
 
 #[test]
