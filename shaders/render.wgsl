@@ -5,7 +5,8 @@ struct View {
     clip_from_camera: mat4x4<f32>,
     // Texture coordinates (xy, in [0, 1]) and depth (z) of the shadow map.
     shadow_from_camera: mat4x4<f32>,
-    // xyz: the direction away from the floor.
+    // xyz: the direction away from the floor; w: a point's height above the robot's base is its part
+    // along xyz, and this.
     up: vec4<f32>,
     // rgb: light from above and from below.
     sky: vec4<f32>,
@@ -76,6 +77,9 @@ fn object_vertex(vertex: Vertex, item: Item) -> Lit {
     return out;
 }
 
+// Distance between the points where the shadow map is read, as a share of its edge.
+const SHADOW_BLUR = 0.004;
+
 struct Pixel {
     @location(0) colour: vec4<f32>,
     @location(1) robot: f32,
@@ -110,12 +114,20 @@ fn object_fragment(in: Lit) -> Pixel {
     let s = view.shadow_from_camera * vec4(in.position + 0.012 * normal, 1.0);
     var lit = 1.0;
     if all(s.xy > vec2(0.0)) && all(s.xy < vec2(1.0)) && s.z < 1.0 {
-        lit = textureSampleCompareLevel(shadow_map, shadow_sampler, s.xy, s.z);
+        lit = 0.0;
+        for (var i = 0; i < 4; i++) {
+            let shift = (vec2(f32(i & 1), f32(i >> 1)) - 0.5) * SHADOW_BLUR;
+            lit += 0.25 * textureSampleCompareLevel(shadow_map, shadow_sampler, s.xy + shift, s.z);
+        }
     }
     lit = mix(1.0, lit, view.light_direction[0].w);
 
     let metal = in.finish.x;
-    var diffuse = mix(view.ground.rgb, view.sky.rgb, 0.5 + 0.5 * dot(normal, view.up.xyz));
+    // Less light comes from all sides close above the robot's base.
+    let height = dot(in.position, view.up.xyz) + view.up.w;
+    let facing_up = dot(normal, view.up.xyz);
+    let open = mix(0.65, 1.0, max(max(smoothstep(0.0, 0.15, height), -height * 20.0), facing_up));
+    var diffuse = mix(view.ground.rgb, view.sky.rgb, 0.5 + 0.5 * facing_up) * min(open, 1.0);
     var specular = vec3(0.0);
     for (var i = 0; i < 3; i++) {
         let to_light = view.light_direction[i].xyz;
@@ -132,8 +144,20 @@ fn object_fragment(in: Lit) -> Pixel {
         reflected += 0.3 * sin(dot(wave.xyz, mirror) + wave.w);
     }
     let surroundings = mix(view.ground.rgb, view.sky.rgb, 0.5 + 0.5 * dot(mirror, view.up.xyz));
-    let shine = albedo * surroundings * 1.6 * max(reflected, 0.0) * mix(0.6, 1.0, lit);
-    let colour = mix(albedo * diffuse, shine, metal) + specular;
+    var shine = surroundings * 1.6 * max(reflected, 0.0) * mix(0.6, 1.0, lit);
+    if metal > 0.0 {
+        // The photo behind stands in for what is around; four points of it, as brushed metal smears.
+        var photo = vec3(0.0);
+        for (var i = 0; i < 4; i++) {
+            let shift = 0.09 * (vec2(f32(i & 1), f32(i >> 1)) - 0.5);
+            let uv = 0.5 + 0.5 * mirror.xy + shift;
+            let texel = textureSampleLevel(photos, photo_sampler, uv, 0, 0.0).rgb;
+            photo += 0.25 * texel * texel;
+        }
+        photo = mix(photo, vec3(dot(photo, vec3(0.21, 0.72, 0.07))), 0.6);
+        shine = mix(shine, 1.3 * photo, 0.4) * mix(0.55, 1.1, dot(normal, to_eye));
+    }
+    let colour = mix(albedo * diffuse, albedo * shine, metal) + specular;
 
     var out: Pixel;
     out.colour = vec4(encode_srgb(colour), 1.0);

@@ -8,11 +8,13 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DVec3};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
 use tempfile::TempDir;
 use whereabot::recording::{
-    CollisionModel, HEIGHT, Header, INTRINSICS, Item, Kind, Lamp, Lighting, Material, Mesh,
-    Protocol, Reader, RecordingError, Renderer, Request, Robot, Sample, Scene, WIDTH, Writer,
-    paper_requests, record,
+    CollisionModel, Effects, Frames, HEIGHT, Header, INTRINSICS, Item, Kind, Lamp, Lighting,
+    Material, Mesh, Picture, Protocol, Reader, RecordingError, Renderer, Request, Robot, Sample,
+    Scene, Shot, Stage, WIDTH, Window, Writer, paper_requests, record,
 };
 
 fn arm_urdf() -> PathBuf {
@@ -103,6 +105,148 @@ fn kinematics_agree_with_the_published_robot() {
         let poses = robot.link_poses(&wrong);
         assert!(farthest(&robot.joint_origins(&poses), &joints) > 1e-3);
         assert!(farthest(&[poses[tool].translation], &[flange]) > 1e-3);
+    }
+}
+
+/// Joints as the manufacturer's DH parameters have them, with the extra base frame of newer packages.
+fn dh_urdf(path: &Path, [d1, a2, a3, d4, d5, d6]: [f64; 6]) {
+    let joints = [
+        ("shoulder_pan", format!("0 0 {d1}"), "0 0 0"),
+        ("shoulder_lift", "0 0 0".into(), "1.57079632679 0 0"),
+        ("elbow", format!("{a2} 0 0"), "0 0 0"),
+        ("wrist_1", format!("{a3} 0 {d4}"), "0 0 0"),
+        ("wrist_2", format!("0 -{d5} 0"), "1.57079632679 0 0"),
+        (
+            "wrist_3",
+            format!("0 {d6} 0"),
+            "1.57079632679 3.14159265359 3.14159265359",
+        ),
+    ];
+    let mut text = String::from("<robot name='e'><link name='base_link'/><link name='link0'/>");
+    text += "<joint name='turn' type='fixed'><parent link='base_link'/><child link='link0'/>";
+    text += "<origin xyz='0 0 0' rpy='0 0 3.14159265359'/></joint>";
+    for (i, (name, xyz, rpy)) in joints.iter().enumerate() {
+        let child = i + 1;
+        text += &format!(
+            "<link name='link{child}'/><joint name='{name}_joint' type='revolute'>
+             <parent link='link{i}'/><child link='link{child}'/><origin xyz='{xyz}' rpy='{rpy}'/>
+             <axis xyz='0 0 1'/>
+             <limit drake:acceleration='1' lower='-6.3' upper='6.3' effort='1' velocity='1'/></joint>"
+        );
+    }
+    fs::write(path, text + "</robot>").unwrap();
+}
+
+fn frames(offsets: [f64; 6]) -> Frames {
+    let names = [
+        "shoulder_pan",
+        "shoulder_lift",
+        "elbow",
+        "wrist_1",
+        "wrist_2",
+        "wrist_3",
+    ];
+    Frames {
+        base_link: "base_link".into(),
+        offsets_m: names.map(String::from).into_iter().zip(offsets).collect(),
+    }
+}
+
+#[test]
+fn another_body_has_its_joints_where_the_robot_has_them() {
+    let folder = TempDir::new().unwrap();
+    let classic = Robot::load(&ur5(folder.path()), &[]).unwrap();
+    let path = folder.path().join("dh.urdf");
+    dh_urdf(
+        &path,
+        [0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823],
+    );
+    let mut other = Robot::load(&path, &[]).unwrap();
+    let apart = |other: &Robot, angles: [f64; 6]| {
+        let expected = classic.joint_origins(&classic.link_poses(&angles));
+        let expected: Vec<[f64; 3]> = expected.iter().map(|p| p.to_array()).collect();
+        farthest(&other.joint_origins(&other.link_poses(&angles)), &expected)
+    };
+    assert!(apart(&other, BENT) > 0.1);
+    let points = [0.0, 0.13585, 0.01615, -0.093, -0.09465, -0.0823];
+    other.set_frames(&frames(points)).unwrap();
+    for angles in [[0.0; 6], BENT, [2.0, -0.4, -1.1, 2.2, 0.8, -3.0]] {
+        assert!(apart(&other, angles) < 1e-6);
+    }
+    let mut wrong = points;
+    wrong[4] = 0.0;
+    other.set_frames(&frames(wrong)).unwrap();
+    assert!(apart(&other, BENT) > 0.05);
+}
+
+#[test]
+fn the_frames_of_the_e_series_put_its_joints_on_its_body() {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("e.urdf");
+    // Points at zero angles, added up by hand: out along the arm, beside it, up.
+    for (name, dh, expected) in [
+        (
+            "ur5e",
+            [0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996],
+            [
+                [0.0, 0.0, 0.1625],
+                [0.0, 0.138, 0.1625],
+                [0.425, 0.007, 0.1625],
+                [0.8172, 0.007, 0.1625],
+                [0.8172, 0.1333, 0.1625],
+                [0.8172, 0.1333, 0.0628],
+            ],
+        ),
+        (
+            "ur3e",
+            [0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921],
+            [
+                [0.0, 0.0, 0.15185],
+                [0.0, 0.12, 0.15185],
+                [0.24355, 0.027, 0.15185],
+                [0.45675, 0.027, 0.15185],
+                [0.45675, 0.13105, 0.15185],
+                [0.45675, 0.13105, 0.0665],
+            ],
+        ),
+    ] {
+        dh_urdf(&path, dh);
+        let mut robot = Robot::load(&path, &[]).unwrap();
+        let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("robots/{name}.json"));
+        robot.set_frames(&Frames::read(&file).unwrap()).unwrap();
+        let points = |angles: [f64; 6]| robot.joint_origins(&robot.link_poses(&angles));
+        assert!(farthest(&points([0.0; 6]), &expected) < 1e-6, "{name}");
+        assert!(farthest(&points([0.02; 6]), &expected) > 5e-3, "{name}");
+    }
+}
+
+#[test]
+fn unusable_bodies_are_named() {
+    let folder = TempDir::new().unwrap();
+    let packages = vec![("arm".into(), arm_urdf().parent().unwrap().to_owned())];
+    let file = folder.path().join("frames.json");
+    let foreign = ur5(folder.path());
+    for (text, urdf, told) in [
+        (
+            "{\"base_link\":\"nowhere\",\"offsets_m\":{}}",
+            &arm_urdf(),
+            "\"nowhere\"",
+        ),
+        (
+            "{\"base_link\":\"base\",\"offsets_m\":{\"hip\":1}}",
+            &arm_urdf(),
+            "\"hip\"",
+        ),
+        ("{\"base_link\":3}", &arm_urdf(), "line 1"),
+        ("{}", &foreign, "pan, lift, elbow"),
+    ] {
+        fs::write(&file, text).unwrap();
+        let bodies = [(file.clone(), urdf.clone())];
+        let error = Stage::load(&arm_urdf(), &packages, &bodies)
+            .err()
+            .unwrap()
+            .to_string();
+        assert!(error.contains(told), "{error}");
     }
 }
 
@@ -400,6 +544,89 @@ fn what_hides_the_robot_is_not_in_the_mask() {
     assert_eq!(covered(Some(ball(Kind::Shadow, near, 0.1))), alone);
 }
 
+#[test]
+fn a_second_arm_is_in_the_mask_and_its_joints_are_not_recorded() {
+    let packages = vec![("arm".into(), arm_urdf().parent().unwrap().to_owned())];
+    let stage = Stage::load(&arm_urdf(), &packages, &[]).unwrap();
+    let visible = |shot: &Shot| -> Vec<Item> {
+        let items = shot.scene.items.iter();
+        items.filter(|i| i.kind == Kind::Robot).cloned().collect()
+    };
+    let shots: Vec<Shot> = (0..60)
+        .map(|id| stage.free_shot(1, id, 1).unwrap())
+        .collect();
+    let counts: Vec<usize> = shots.iter().map(|shot| visible(shot).len()).collect();
+    let one = counts.iter().copied().filter(|&c| c > 0).min().unwrap();
+    assert!(counts.iter().all(|&c| c == 0 || c == one || c == 2 * one));
+    assert!(counts.contains(&0) && counts.contains(&one));
+    let device = common::device();
+    let mut renderer = Renderer::new(&device, stage.meshes()).unwrap();
+    let mut seen = 0;
+    for shot in shots
+        .iter()
+        .filter(|shot| visible(shot).len() == 2 * one)
+        .take(4)
+    {
+        let items = visible(shot);
+        let mut covered = |items: &[Item]| {
+            let scene = Scene {
+                items: items.to_vec(),
+                ..shot.scene.clone()
+            };
+            let picture = renderer.draw(&scene, &black(), None).unwrap();
+            picture.mask.iter().filter(|&&m| m == 255).count()
+        };
+        let (both, first, second) = (
+            covered(&items),
+            covered(&items[..one]),
+            covered(&items[one..]),
+        );
+        assert!(both > first && first > 0 && second > 0);
+        seen += 1;
+        // The recorded joints belong to the first arm: its pan link is there.
+        let robot = shot.robot.as_ref().unwrap();
+        let robot_poses = stage.robot().link_poses(&robot.angles);
+        let expected = stage.robot().joint_origins(&robot_poses);
+        for (&found, expected) in robot.joints.iter().zip(expected) {
+            let expected = shot.scene.camera_from_base.transform_point3(expected);
+            assert!(found.distance(expected) < 1e-9);
+        }
+        let base = |item: &Item| item.base_from_mesh.translation.length();
+        assert!(base(&items[0]) < base(&items[one]));
+    }
+    assert!(seen > 0);
+}
+
+#[test]
+fn pictures_of_other_shapes_have_black_edges_without_a_mask() {
+    let mut rng = ChaCha8Rng::seed_from_u64(0);
+    let (mut whole, mut tall, mut flat) = (0, 0, 0);
+    for _ in 0..60 {
+        let window = Window::any(&mut rng);
+        let mut picture = Picture {
+            rgb: vec![200; (3 * WIDTH * HEIGHT) as usize],
+            mask: vec![255; (WIDTH * HEIGHT) as usize],
+        };
+        Effects::any(&mut rng, window).apply(&mut picture);
+        let [left, top, right, bottom] = window.edges();
+        whole += usize::from(window == Window::WHOLE);
+        tall += usize::from(left > 0.0);
+        flat += usize::from(top > 0.0);
+        // In the middle, but for the pixel that an odd size leaves over.
+        assert!((left + right - 512.0).abs() <= 1.0 && (top + bottom - 424.0).abs() <= 1.0);
+        let pixels = picture.rgb.as_chunks::<3>().0.iter();
+        for (i, (pixel, &mask)) in (0..).zip(pixels.zip(&picture.mask)) {
+            let inside = window.contains([i % WIDTH, i / WIDTH]);
+            assert_eq!(mask, if inside { 255 } else { 0 });
+            assert_eq!(pixel.iter().all(|&c| c > 0), inside);
+        }
+    }
+    assert!(
+        whole > tall && tall > 0 && flat > 0,
+        "{whole} {tall} {flat}"
+    );
+}
+
 /// A folder with two pictures and one that only has a picture's name.
 fn backgrounds(folder: &Path) -> PathBuf {
     let folder = folder.join("backgrounds");
@@ -418,6 +645,7 @@ fn request(folder: &Path, out: &str) -> Request {
     Request {
         urdf: arm_urdf(),
         packages: vec![("arm".into(), arm_urdf().parent().unwrap().to_owned())],
+        bodies: Vec::new(),
         robot: "arm".into(),
         backgrounds,
         samples: 6,
@@ -483,7 +711,7 @@ fn a_recording_tells_the_truth_about_its_pictures() {
             empty += 1;
             continue;
         };
-        assert!((0.01..0.5).contains(&share), "{share}");
+        assert!((0.002..0.5).contains(&share), "{share}");
         let matrix = sample.camera_from_base.unwrap();
         let camera_from_base =
             DAffine3::from_mat4(glam::DMat4::from_cols_array(&matrix).transpose());
@@ -595,7 +823,8 @@ fn a_fixed_camera_stays_where_it_is() {
     let picture = |sample| reader.image(sample).unwrap();
     let (one, two) = (picture(first), picture(&reader.samples()[1]));
     let differ = one.pixels().zip(two.pixels()).filter(|(a, b)| a != b);
-    assert!(differ.count() > 100_000);
+    let differ = differ.count();
+    assert!(differ > 100_000, "{differ} pixels");
 
     let mut other = request.clone();
     other.out = folder.path().join("other");

@@ -25,6 +25,10 @@ pub struct Args {
     /// Where package://NAME/ is; by default searched upwards from the URDF
     #[arg(long, value_name = "NAME=DIR", value_parser = package)]
     package: Vec<(String, PathBuf)>,
+    /// Another body of the same robot: where its joints' points are (JSON) and its URDF; repeatable.
+    /// With a free camera the robot has one of these bodies as often as its own
+    #[arg(long, value_name = "FRAMES=URDF", value_parser = body)]
+    body: Vec<(PathBuf, PathBuf)>,
     /// The robot's name, which the recording carries
     #[arg(long, value_name = "NAME", required_unless_present = "paper")]
     robot: Option<String>,
@@ -58,6 +62,13 @@ fn package(text: &str) -> Result<(String, PathBuf), String> {
     }
 }
 
+fn body(text: &str) -> Result<(PathBuf, PathBuf), String> {
+    match text.split_once('=') {
+        Some((frames, urdf)) => Ok((frames.into(), urdf.into())),
+        None => Err("expected FRAMES=URDF".to_owned()),
+    }
+}
+
 /// The one recording, or the paper's nine; `Err` says what is wrong with `--urdf`.
 fn requests(args: Args) -> Result<Vec<Request>, String> {
     if args.paper {
@@ -76,6 +87,7 @@ fn requests(args: Args) -> Result<Vec<Request>, String> {
     Ok(vec![Request {
         urdf,
         packages: args.package,
+        bodies: args.body,
         // The parser has seen to these two.
         robot: args.robot.unwrap_or_default(),
         samples: args.samples.unwrap_or_default(),

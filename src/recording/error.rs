@@ -22,6 +22,14 @@ pub enum RecordingError {
         /// What was expected and what was found.
         message: String,
     },
+    /// What a body's frames file says cannot be used.
+    #[error("{}: {message}", path.display())]
+    Frames {
+        /// The frames file.
+        path: PathBuf,
+        /// What was expected and what was found.
+        message: String,
+    },
     /// A mesh that the robot description names is not there.
     #[error("{}: link \"{link}\" wants the mesh \"{name}\", which was not found (looked for {})", urdf.display(), looked_for.display())]
     MissingMesh {

@@ -58,6 +58,9 @@ pub struct Source {
     /// The robot description's file name. Each synthetic recording has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub urdf: Option<String>,
+    /// The file names of the descriptions of the robot's other bodies.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub bodies: Vec<String>,
     /// How camera and robot move. Each synthetic recording has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub protocol: Option<Protocol>,

@@ -25,13 +25,13 @@ use std::sync::{Mutex, mpsc};
 
 pub use background::{Backgrounds, PhotoView};
 pub use collision::CollisionModel;
-pub use effects::Effects;
+pub use effects::{Effects, Window};
 pub use error::RecordingError;
 pub use format::{Header, Protocol, Sample, Source, SourceKind, Writer, write_picture};
 pub use mesh::Mesh;
 pub use reader::Reader;
 pub use render::{Picture, Renderer};
-pub use robot::{Joint, Link, Robot};
+pub use robot::{Frames, Joint, Link, Robot};
 pub use scene::{Item, Kind, Lamp, Lighting, Material, Scene};
 pub use stage::{Posed, Shot, Stage, Station};
 
@@ -57,6 +57,8 @@ pub struct Request {
     pub urdf: PathBuf,
     /// Where `package://NAME/` is, for packages that are not found upwards from the URDF.
     pub packages: Vec<(String, PathBuf)>,
+    /// Other bodies of the robot, which free cameras see as often: their [`Frames`] files and URDFs.
+    pub bodies: Vec<(PathBuf, PathBuf)>,
     /// The robot's name, for the header.
     pub robot: String,
     /// A folder of background photos.
@@ -99,6 +101,7 @@ pub fn paper_requests(
         .map(|((robot, number, samples, urdf), seed)| Request {
             urdf,
             packages: packages.to_vec(),
+            bodies: Vec::new(),
             robot: robot.to_owned(),
             backgrounds: backgrounds.to_owned(),
             samples,
@@ -120,7 +123,7 @@ pub fn record(
     progress: impl Fn(u64),
 ) -> Result<(), RecordingError> {
     let backgrounds = Backgrounds::open(&request.backgrounds)?;
-    let stage = Stage::load(&request.urdf, &request.packages)?;
+    let stage = Stage::load(&request.urdf, &request.packages, &request.bodies)?;
     let header = Header {
         format: format::FORMAT.into(),
         version: format::VERSION,
@@ -138,10 +141,8 @@ pub fn record(
             kind: SourceKind::Synthetic,
             generator: concat!("whereabot ", env!("CARGO_PKG_VERSION")).into(),
             seed: Some(request.seed),
-            urdf: request
-                .urdf
-                .file_name()
-                .map(|n| n.to_string_lossy().into_owned()),
+            urdf: Some(file_name(&request.urdf)),
+            bodies: request.bodies.iter().map(|(_, b)| file_name(b)).collect(),
             protocol: Some(request.protocol),
             planned: (request.protocol == Protocol::FixedCamera).then_some(request.samples),
         },
@@ -180,7 +181,7 @@ pub fn record(
             .lock()
             .unwrap_or_else(std::sync::PoisonError::into_inner)
             .draw(&shot.scene, &background, texture.as_deref())?;
-        shot.effects.apply(&mut picture.rgb);
+        shot.effects.apply(&mut picture);
         let sample = describe(id, &shot, &picture);
         write_picture(&folder, &sample, &picture)?;
         Ok(sample)
@@ -220,6 +221,12 @@ pub fn record(
         drop(receive);
         result
     })
+}
+
+fn file_name(path: &Path) -> String {
+    let name = path.file_name();
+    name.map(|n| n.to_string_lossy().into_owned())
+        .unwrap_or_default()
 }
 
 fn describe(id: u64, shot: &Shot, picture: &Picture) -> Sample {

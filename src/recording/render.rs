@@ -58,7 +58,7 @@ struct View {
 }
 
 /// The most items that one scene may hold.
-const ITEMS: usize = 1024;
+const ITEMS: usize = 4096;
 
 struct Range {
     first_index: u32,
@@ -729,7 +729,10 @@ fn view(scene: &Scene) -> View {
     View {
         clip_from_camera: clip_from_camera().to_cols_array_2d(),
         shadow_from_camera: shadow.transpose().to_cols_array_2d(),
-        up: four(turn(DVec3::Z), 0.0),
+        up: four(
+            turn(DVec3::Z),
+            -turn(DVec3::Z).dot(scene.camera_from_base.translation.as_vec3()),
+        ),
         sky: four(light.sky.into(), 0.0),
         ground: four(light.ground.into(), 0.0),
         light_direction: [

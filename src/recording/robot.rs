@@ -1,6 +1,6 @@
 //! A robot from its URDF: links, joints, meshes, forward kinematics.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
 
@@ -34,6 +34,37 @@ pub struct Joint {
     pub child: usize,
     /// The link that the joint hangs on.
     pub parent: usize,
+    /// The unit vector that the joint turns about, in its own frame.
+    pub axis: DVec3,
+    /// Where on its axis the joint's point is, metres from the frame's origin; see [`Frames`].
+    pub offset: f64,
+}
+
+/// How the frames of a URDF become those of another one for the same arm. A joint's frame may lie
+/// anywhere along the joint's axis, and URDFs differ in where: this moves the joints' points along the
+/// axes, and says which link's frame is the base frame.
+#[derive(Debug, Clone, PartialEq, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Frames {
+    /// The link whose frame is the robot's base frame.
+    pub base_link: String,
+    /// For each joint, by its name without `_joint`: where its point is along its axis, metres from the
+    /// origin of the URDF's frame.
+    pub offsets_m: BTreeMap<String, f64>,
+}
+
+impl Frames {
+    /// Reads a JSON file with the fields of this type.
+    ///
+    /// # Errors
+    /// The file cannot be read, or is no such JSON (the error names the line).
+    pub fn read(path: &Path) -> Result<Frames, RecordingError> {
+        let text = std::fs::read_to_string(path).map_err(RecordingError::io(path))?;
+        serde_json::from_str(&text).map_err(|cause| RecordingError::Frames {
+            path: path.to_owned(),
+            message: cause.to_string(),
+        })
+    }
 }
 
 /// A step of the way from the root to all links, parents first.
@@ -55,7 +86,10 @@ pub struct Robot {
     /// The joints that move, base first.
     pub joints: Vec<Joint>,
     steps: Vec<Step>,
+    /// The link that carries the first joint.
     base: usize,
+    /// The link whose frame is the base frame.
+    frame: usize,
 }
 
 impl Robot {
@@ -66,7 +100,15 @@ impl Robot {
     /// A file is missing or unreadable (the error names it), or the URDF has no revolute joint, or its
     /// joints do not form a tree.
     pub fn load(urdf: &Path, packages: &[(String, PathBuf)]) -> Result<Robot, RecordingError> {
-        let text = std::fs::read_to_string(urdf).map_err(RecordingError::io(urdf))?;
+        let mut text = std::fs::read_to_string(urdf).map_err(RecordingError::io(urdf))?;
+        // Drake's attributes mostly come without the declaration that XML wants.
+        if text.contains(" drake:") && !text.contains("xmlns:drake") {
+            text = text.replacen(
+                "<robot ",
+                "<robot xmlns:drake=\"https://drake.mit.edu\" ",
+                1,
+            );
+        }
         let fail = |message: String| RecordingError::Urdf {
             path: urdf.to_owned(),
             message,
@@ -163,16 +205,16 @@ impl Robot {
                         .strip_suffix("_joint")
                         .unwrap_or(&joint.name)
                         .to_owned();
+                    let axis = DVec3::from(*joint.axis.xyz).normalize_or(DVec3::X);
                     joints.push(Joint {
                         name,
                         range,
                         child,
                         parent,
+                        axis,
+                        offset: 0.0,
                     });
-                    (
-                        DVec3::from(*joint.axis.xyz).normalize_or(DVec3::X),
-                        joints.len() - 1,
-                    )
+                    (axis, joints.len() - 1)
                 });
                 steps.push(Step {
                     parent,
@@ -208,11 +250,30 @@ impl Robot {
             joints,
             steps,
             base,
+            frame: base,
         })
     }
 
-    /// Poses of all links in the base frame (the frame of the first joint's parent link), in the order
-    /// of `links`. `angles`: one a moving joint, radians; missing ones count as zero.
+    /// Replaces the base frame and the joints' points.
+    ///
+    /// # Errors
+    /// The robot lacks the base link or a joint that is named; the message says which.
+    pub fn set_frames(&mut self, frames: &Frames) -> Result<(), String> {
+        let link = &frames.base_link;
+        self.frame = self
+            .find_link(link)
+            .ok_or_else(|| format!("expected a link \"{link}\", found none"))?;
+        for (name, &offset) in &frames.offsets_m {
+            let joint = self.joints.iter_mut().find(|j| j.name == *name);
+            let joint =
+                joint.ok_or_else(|| format!("expected a moving joint \"{name}\", found none"))?;
+            joint.offset = offset;
+        }
+        Ok(())
+    }
+
+    /// Poses of all links in the base frame (the frame of the first joint's parent link, or that which
+    /// [`Frames`] name), in the order of `links`. `angles`: one a moving joint, radians; missing ones count as zero.
     pub fn link_poses(&self, angles: &[f64]) -> Vec<DAffine3> {
         let mut poses = vec![DAffine3::IDENTITY; self.links.len()];
         for step in &self.steps {
@@ -226,17 +287,37 @@ impl Robot {
                 *slot = pose;
             }
         }
-        let to_base = poses.get(self.base).copied().unwrap_or_default().inverse();
+        let to_base = poses.get(self.frame).copied().unwrap_or_default().inverse();
         poses.iter().map(|&pose| to_base * pose).collect()
     }
 
-    /// Origins of the moving joints' frames in the base frame, metres, from link poses.
+    /// Points of the moving joints in the base frame, metres, from link poses: the origins of their
+    /// frames, or where [`Frames`] put them.
     pub fn joint_origins(&self, link_poses: &[DAffine3]) -> Vec<DVec3> {
-        let pose = |link| link_poses.get(link).copied().unwrap_or_default();
-        self.joints
-            .iter()
-            .map(|j| pose(j.child).translation)
-            .collect()
+        self.axes(link_poses).map(|(point, _)| point).collect()
+    }
+
+    /// The arm as a line through its links' middles, base first: from each joint's point to the nearest
+    /// point of the next one's axis, then along that axis.
+    pub(super) fn spine(&self, link_poses: &[DAffine3]) -> Vec<DVec3> {
+        let base = link_poses.get(self.base).copied().unwrap_or_default();
+        let mut at = base.translation;
+        let mut spine = vec![at];
+        for (point, axis) in self.axes(link_poses) {
+            spine.push(point + axis * (at - point).dot(axis));
+            spine.push(point);
+            at = point;
+        }
+        spine
+    }
+
+    /// Points and directions of the joints' axes in the base frame.
+    fn axes(&self, link_poses: &[DAffine3]) -> impl Iterator<Item = (DVec3, DVec3)> {
+        self.joints.iter().map(|joint| {
+            let pose = link_poses.get(joint.child).copied().unwrap_or_default();
+            let point = pose.transform_point3(joint.axis * joint.offset);
+            (point, pose.transform_vector3(joint.axis))
+        })
     }
 
     /// The link that carries the first moving joint.

@@ -1,6 +1,6 @@
 //! Random shots of a robot: its pose, the camera, and how it all looks.
 
-use std::f64::consts::PI;
+use std::f64::consts::{PI, TAU};
 use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DMat3, DQuat, DVec3};
@@ -12,10 +12,10 @@ use rayon::prelude::*;
 use super::background::PhotoView;
 use super::chance::{direction, grey, hsv, normal};
 use super::collision::CollisionModel;
-use super::effects::Effects;
+use super::effects::{Effects, Window};
 use super::mesh::Mesh;
-use super::props::{Builder, MATT, PRIMITIVES, Support, lighting};
-use super::robot::Robot;
+use super::props::{Builder, MATT, PRIMITIVES, Support, lighting, line_distance};
+use super::robot::{Frames, Robot};
 use super::scene::{Item, Kind, Material, Scene};
 use super::sweep::Sweep;
 use super::{HEIGHT, INTRINSICS, RecordingError, WIDTH};
@@ -72,17 +72,31 @@ struct Part {
     finish: Finish,
 }
 
-/// A robot ready to be put into scenes.
-pub struct Stage {
+/// One of the bodies that a recording's robot may have.
+struct Body {
     robot: Robot,
     collision: CollisionModel,
-    meshes: Vec<Mesh>,
     visual: Vec<Part>,
     shadow: Vec<(usize, usize)>,
     /// The farthest that a joint gets from the second joint, metres.
     reach: f64,
     /// The frame that grippers are put on, z outwards.
     tool: Option<usize>,
+}
+
+/// A body in a pose.
+struct Arm<'a> {
+    body: &'a Body,
+    angles: Vec<f64>,
+    /// Poses of the links in the base frame of the recording's robot.
+    poses: Vec<DAffine3>,
+}
+
+/// A robot ready to be put into scenes.
+pub struct Stage {
+    meshes: Vec<Mesh>,
+    main: Body,
+    others: Vec<Body>,
 }
 
 /// A recording with a fixed camera: what stays the same, and the robot's poses.
@@ -92,15 +106,9 @@ pub struct Station {
     poses: Vec<Vec<f64>>,
 }
 
-impl Stage {
-    /// Loads a robot and its meshes; see [`Robot::load`].
-    ///
-    /// # Errors
-    /// As [`Robot::load`].
-    pub fn load(urdf: &Path, packages: &[(String, PathBuf)]) -> Result<Stage, RecordingError> {
-        let mut robot = Robot::load(urdf, packages)?;
+impl Body {
+    fn load(mut robot: Robot, meshes: &mut Vec<Mesh>) -> Body {
         let collision = CollisionModel::new(&robot);
-        let mut meshes: Vec<Mesh> = PRIMITIVES.iter().map(|make| make()).collect();
         let mut visual = Vec::new();
         let mut shadow = Vec::new();
         for (index, link) in robot.links.iter_mut().enumerate() {
@@ -118,10 +126,9 @@ impl Stage {
             }
         }
         let tool = robot.find_link("tool0");
-        let mut stage = Stage {
+        let mut body = Body {
             robot,
             collision,
-            meshes,
             visual,
             shadow,
             reach: 0.0,
@@ -129,8 +136,8 @@ impl Stage {
         };
         let mut rng = ChaCha8Rng::seed_from_u64(0);
         for _ in 0..200 {
-            let angles = stage.any_angles(&mut rng);
-            let origins = stage.robot.joint_origins(&stage.robot.link_poses(&angles));
+            let angles = body.any_angles(&mut rng);
+            let origins = body.robot.joint_origins(&body.robot.link_poses(&angles));
             let centre = origins
                 .get(1)
                 .or(origins.first())
@@ -140,19 +147,9 @@ impl Stage {
                 .iter()
                 .map(|o| o.distance(centre))
                 .fold(0.1, f64::max);
-            stage.reach = stage.reach.max(farthest);
+            body.reach = body.reach.max(farthest);
         }
-        Ok(stage)
-    }
-
-    /// All meshes that scenes refer to.
-    pub fn meshes(&self) -> &[Mesh] {
-        &self.meshes
-    }
-
-    /// The robot.
-    pub fn robot(&self) -> &Robot {
-        &self.robot
+        body
     }
 
     fn any_angles(&self, rng: &mut ChaCha8Rng) -> Vec<f64> {
@@ -196,14 +193,83 @@ impl Stage {
         angles
     }
 
-    fn free_angles(&self, rng: &mut ChaCha8Rng) -> Option<(Vec<f64>, Vec<DAffine3>)> {
-        (0..200).find_map(|_| {
-            let angles = self.angles(rng);
-            let poses = self.robot.link_poses(&angles);
-            let free = !self.collision.floor_collision(&poses, 0.0)
-                && !self.collision.self_collision(&poses);
-            free.then_some((angles, poses))
+    fn arm(&self, angles: Vec<f64>) -> Arm<'_> {
+        Arm {
+            body: self,
+            poses: self.robot.link_poses(&angles),
+            angles,
+        }
+    }
+
+    fn any_arm(&self, rng: &mut ChaCha8Rng) -> Option<Arm<'_>> {
+        (0..200)
+            .map(|_| self.arm(self.angles(rng)))
+            .find(Arm::is_free)
+    }
+}
+
+impl Stage {
+    /// Loads a robot and its meshes; see [`Robot::load`]. `bodies` are other bodies that the robot may
+    /// have in recordings with a free camera: [`Frames`] and URDF.
+    ///
+    /// # Errors
+    /// As [`Robot::load`] and [`Frames::read`]; a body's joints have other names than the robot's, or
+    /// it lacks what its frames name.
+    pub fn load(
+        urdf: &Path,
+        packages: &[(String, PathBuf)],
+        bodies: &[(PathBuf, PathBuf)],
+    ) -> Result<Stage, RecordingError> {
+        let mut meshes: Vec<Mesh> = PRIMITIVES.iter().map(|make| make()).collect();
+        let main = Body::load(Robot::load(urdf, packages)?, &mut meshes);
+        let names = |robot: &Robot| -> Vec<String> {
+            robot.joints.iter().map(|j| j.name.clone()).collect()
+        };
+        let mut others = Vec::new();
+        for (frames, urdf) in bodies {
+            let mut robot = Robot::load(urdf, packages)?;
+            let (expected, found) = (names(&main.robot), names(&robot));
+            if found != expected {
+                return Err(RecordingError::Urdf {
+                    path: urdf.clone(),
+                    message: format!(
+                        "expected the robot's joints ({}), found {}",
+                        expected.join(", "),
+                        found.join(", ")
+                    ),
+                });
+            }
+            robot
+                .set_frames(&Frames::read(frames)?)
+                .map_err(|message| RecordingError::Frames {
+                    path: frames.clone(),
+                    message: format!("{message} in {}", urdf.display()),
+                })?;
+            others.push(Body::load(robot, &mut meshes));
+        }
+        Ok(Stage {
+            meshes,
+            main,
+            others,
         })
+    }
+
+    /// All meshes that scenes refer to.
+    pub fn meshes(&self) -> &[Mesh] {
+        &self.meshes
+    }
+
+    /// The robot.
+    pub fn robot(&self) -> &Robot {
+        &self.main.robot
+    }
+
+    /// The robot as it is described, or one of its other bodies as often.
+    fn any_body(&self, rng: &mut ChaCha8Rng) -> &Body {
+        let other = self.others.choose(rng);
+        other
+            .filter(|_| rng.random_bool(0.55))
+            .unwrap_or(&self.main)
     }
 
     /// Sample `id` of a recording with a free camera: the same for the same `seed` and `id`.
@@ -216,26 +282,27 @@ impl Stage {
         rng.set_stream(id);
         let mut look = ChaCha8Rng::from_rng(&mut rng);
         let support = Support::any(&mut look);
+        let window = Window::any(&mut look);
         if rng.random_bool(0.15) {
-            return Ok(self.empty_shot(support, &mut look, &mut rng, photos));
+            let camera = self.look_around(&support, &mut rng);
+            return Ok(self.dress(camera, window, support, &[], &mut look, &mut rng, photos));
         }
+        let body = self.any_body(&mut rng);
         for _ in 0..100 {
-            let Some((angles, poses)) = self.free_angles(&mut rng) else {
+            let Some(arm) = body.any_arm(&mut rng) else {
                 continue;
             };
             for _ in 0..8 {
-                let camera = self.aim(&poses, &support, &mut rng);
-                if let Some(camera_from_base) = camera {
-                    let robot = (angles, poses);
-                    return Ok(self.dress(
-                        camera_from_base,
-                        support,
-                        Some(robot),
-                        &mut look,
-                        &mut rng,
-                        photos,
-                    ));
-                }
+                let Some(camera) = self.aim(&arm, &support, &window, &mut rng) else {
+                    continue;
+                };
+                let second = if rng.random_bool(0.14) {
+                    self.second(&arm, camera, &window, &mut rng)
+                } else {
+                    None
+                };
+                let arms: Vec<Arm> = std::iter::once(arm).chain(second).collect();
+                return Ok(self.dress(camera, window, support, &arms, &mut look, &mut rng, photos));
             }
         }
         Err(RecordingError::NoScene { id })
@@ -256,26 +323,17 @@ impl Stage {
         let Some(angles) = pose else {
             return Err(RecordingError::NoScene { id });
         };
-        let poses = self.robot.link_poses(angles);
+        let arm = self.main.arm(angles.clone());
         let camera_from_base = station.camera_from_base;
         let mut rng = ChaCha8Rng::seed_from_u64(station.seed);
         rng.set_stream(id);
         let mut look = station_rng(station.seed);
         let support = Support::any(&mut look);
-        let mut arm = self.robot.joint_origins(&poses);
-        arm.insert(0, DVec3::ZERO);
-        let centre = arm.iter().sum::<DVec3>() / arm.len() as f64;
-        let mut build = Builder {
-            items: Vec::new(),
-            camera: camera_from_base.inverse().translation,
-            arm,
-        };
+        let mut build = Builder::new(camera_from_base);
         support.build(&mut build, &mut look);
-        self.add_robot(&mut build, &poses, &mut look);
         let texture = PhotoView::any(&mut look, photos, false);
-        if let Some(tool) = self.tool.and_then(|t| poses.get(t)) {
-            build.gripper(*tool, support.is_table(), &mut look);
-        }
+        // Last, as poses that leave no room for a tool draw less.
+        let centre = put_arm(&mut build, &arm, &support, &mut look);
         let textured = build.items.iter().any(|item| item.material.photo > 0.0);
         Ok(Shot {
             scene: Scene {
@@ -286,11 +344,8 @@ impl Stage {
             },
             background: PhotoView::any(&mut rng, photos, true),
             texture: textured.then_some(texture),
-            effects: Effects::any(&mut rng),
-            robot: Some(Posed {
-                angles: angles.clone(),
-                joints: self.seen_from(camera_from_base, &poses),
-            }),
+            effects: Effects::any(&mut rng, Window::WHOLE),
+            robot: Some(arm.posed(camera_from_base)),
         })
     }
 
@@ -308,22 +363,21 @@ impl Stage {
         let camera_from_base = self.station_camera(seed);
         let kept = |sweep: &Sweep| -> Vec<Vec<f64>> {
             let keep = |point: usize| {
-                let angles = sweep.angles(point);
-                let poses = self.robot.link_poses(&angles);
-                let seen = self.in_view(camera_from_base, &poses, self.robot.joints.len());
-                (seen && self.free(&poses)).then_some(angles)
+                let arm = self.main.arm(sweep.angles(point));
+                let seen = arm.in_view(camera_from_base, &Window::WHOLE) >= Some(arm.joints());
+                (seen && arm.is_free()).then_some(arm.angles)
             };
             (0..sweep.len()).into_par_iter().filter_map(keep).collect()
         };
         // So many points at most for each sample: more would say that hardly any pose can be seen.
         const POINTS: usize = 400;
-        let mut sweep = Sweep::new(&self.robot, samples);
+        let mut sweep = Sweep::new(&self.main.robot, samples);
         let mut poses = kept(&sweep);
         while poses.len() < samples {
             // A coarse sweep may say little about how many poses a finer one has.
             let share = (poses.len() as f64 / sweep.len() as f64).max(0.125);
             let wanted = (samples as f64 / share) as usize;
-            let finer = Sweep::new(&self.robot, wanted.max(sweep.len() + 1));
+            let finer = Sweep::new(&self.main.robot, wanted.max(sweep.len() + 1));
             // A robot whose joints cannot turn has no finer sweep.
             if sweep.len() > POINTS.saturating_mul(samples) || finer == sweep {
                 return Err(RecordingError::TooFewPoses {
@@ -348,11 +402,11 @@ impl Stage {
         const POSES: usize = 60;
         let mut rng = station_rng(seed);
         let support = Support::any(&mut rng.clone());
-        let sweep = Sweep::new(&self.robot, 10 * POSES);
-        let poses: Vec<Vec<DAffine3>> = (0..sweep.len())
+        let sweep = Sweep::new(&self.main.robot, 10 * POSES);
+        let poses: Vec<Arm> = (0..sweep.len())
             .step_by(sweep.len().div_ceil(5 * POSES))
-            .map(|point| self.robot.link_poses(&sweep.angles(point)))
-            .filter(|poses| self.free(poses))
+            .map(|point| self.main.arm(sweep.angles(point)))
+            .filter(Arm::is_free)
             .take(POSES)
             .collect();
         let mut best = (-1.0, DAffine3::IDENTITY);
@@ -362,15 +416,16 @@ impl Stage {
                 support.lowest_camera().max(5f64.to_radians()),
                 PI / 4.0,
             );
-            let distance = self.reach * rng.random_range(0.9..2.0);
-            let aim = DVec3::new(0.0, 0.0, self.reach * rng.random_range(0.2..0.6));
+            let distance = self.main.reach * rng.random_range(0.9..2.0);
+            let aim = DVec3::new(0.0, 0.0, self.main.reach * rng.random_range(0.2..0.6));
             let pixel = [INTRINSICS.cx, INTRINSICS.cy + rng.random_range(-20.0..20.0)];
             let camera = look_at(aim, direction, distance, 0.0, pixel);
             // What is seen at another size counts against the camera.
+            let whole = &Window::WHOLE;
             let score: f64 = poses
                 .par_iter()
-                .filter(|pose| self.in_view(camera, pose, self.robot.joints.len()))
-                .map(|pose| match self.coverage(camera, pose) {
+                .filter(|arm| arm.in_view(camera, whole) >= Some(arm.joints()))
+                .map(|arm| match self.coverage(camera, arm, whole) {
                     share if (0.06..0.17).contains(&share) => 1.0,
                     _ => -1.0,
                 })
@@ -382,74 +437,102 @@ impl Stage {
         best.1
     }
 
-    /// Whether the robot meets neither itself nor the floor.
-    fn free(&self, poses: &[DAffine3]) -> bool {
-        !self.collision.floor_collision(poses, 0.0) && !self.collision.self_collision(poses)
-    }
-
-    fn seen_from(&self, camera_from_base: DAffine3, poses: &[DAffine3]) -> Vec<DVec3> {
-        let joints = self.robot.joint_origins(poses);
-        let seen = joints.into_iter();
-        seen.map(|j| camera_from_base.transform_point3(j)).collect()
-    }
-
-    /// A camera that shows the robot at a random size, if the first try keeps the rules.
-    fn aim(&self, poses: &[DAffine3], support: &Support, rng: &mut ChaCha8Rng) -> Option<DAffine3> {
-        let wanted = (0.16f64.ln() + 0.5 * normal(rng)).exp().clamp(0.055, 0.43);
-        let direction = direction(rng, support.lowest_camera(), PI / 3.0);
-        let origins = self.robot.joint_origins(poses);
+    /// A camera that shows the arm at a random size, if the first try keeps the rules.
+    fn aim(
+        &self,
+        arm: &Arm,
+        support: &Support,
+        window: &Window,
+        rng: &mut ChaCha8Rng,
+    ) -> Option<DAffine3> {
+        let wanted = (0.095f64.ln() + 0.8 * normal(rng)).exp().clamp(0.015, 0.44);
+        let lowest = support.lowest_camera();
+        let level = 25f64.to_radians();
+        let direction = if rng.random_bool(0.6) {
+            direction(rng, lowest, level)
+        } else {
+            direction(rng, level, PI / 3.0)
+        };
+        let cut = rng.random_bool(0.15) || wanted > 0.2;
+        let origins = arm.joint_origins();
         let nearness: f64 = rng.random_range(0.0..1.0);
         let middle = origins.iter().sum::<DVec3>() / origins.len() as f64;
         let aim = middle.lerp(*origins.choose(rng)?, 0.7 * nearness);
-        let roll = rng.random_range(-10f64..10.0).to_radians();
-        let (width, height) = (f64::from(WIDTH), f64::from(HEIGHT));
+        let roll = any_roll(rng);
+        // Small arms may stand anywhere.
+        let spread = (0.22 - 0.5 * wanted).max(0.1);
+        let [left, top, right, bottom] = window.edges();
         let pixel = [
-            INTRINSICS.cx + 0.13 * width * normal(rng),
-            INTRINSICS.cy + 0.10 * height * normal(rng),
+            0.5 * (left + right) + spread * (right - left) * normal(rng),
+            0.5 * (top + bottom) + spread * (bottom - top) * normal(rng),
         ];
-        let nearest = 0.55 * self.reach;
-        let mut distance = self.reach / wanted.sqrt() * 0.36;
+        let reach = arm.body.reach;
+        let nearest = 0.5 * reach;
+        let mut distance = reach / wanted.sqrt() * 0.36;
         let mut camera = look_at(aim, direction, distance.max(nearest), roll, pixel);
         for _ in 0..4 {
-            let ratio = self.coverage(camera, poses) / wanted;
-            distance = (distance * ratio.sqrt().clamp(0.6, 1.6)).clamp(nearest, 2.8 * self.reach);
+            let ratio = self.coverage(camera, arm, window) / wanted;
+            distance = (distance * ratio.sqrt().clamp(0.6, 1.6)).clamp(nearest, 4.0 * reach);
             camera = look_at(aim, direction, distance, roll, pixel);
         }
-        let coverage = self.coverage(camera, poses);
+        let coverage = self.coverage(camera, arm, window);
         let low = camera.inverse().translation.z < 0.08 && support.is_table();
-        let fits = (0.05..0.45).contains(&coverage) && (0.6..1.6).contains(&(coverage / wanted));
-        (fits && !low && self.in_view(camera, poses, 4)).then_some(camera)
+        let fits = (0.013..0.45).contains(&coverage) && (0.6..1.6).contains(&(coverage / wanted));
+        let inside = if cut { 3 } else { arm.joints() };
+        (fits && !low && arm.in_view(camera, window)? >= inside.min(arm.joints())).then_some(camera)
     }
 
-    /// Whether all joints are well before the camera, and at least `inside` of them in the picture.
-    fn in_view(&self, camera_from_base: DAffine3, poses: &[DAffine3], inside: usize) -> bool {
-        let joints = self.robot.joint_origins(poses);
-        let seen = joints.iter().map(|&j| camera_from_base.transform_point3(j));
-        let mut count = 0;
-        for joint in seen {
-            if joint.z < 0.2 {
-                return false;
-            }
-            if let Some([u, v]) = INTRINSICS.project(joint.to_array()) {
-                let inside = (0.0..f64::from(WIDTH - 1)).contains(&u)
-                    && (0.0..f64::from(HEIGHT - 1)).contains(&v);
-                count += usize::from(inside);
-            }
-        }
-        count >= inside.min(joints.len())
+    /// A second arm in the same place, clear of the first and smaller in the picture.
+    fn second(
+        &self,
+        first: &Arm,
+        camera: DAffine3,
+        window: &Window,
+        rng: &mut ChaCha8Rng,
+    ) -> Option<Arm<'_>> {
+        let spine = first.body.robot.spine(&first.poses);
+        let largest = self.coverage(camera, first, window);
+        (0..12).find_map(|_| {
+            let mut arm = self.any_body(rng).any_arm(rng)?;
+            let distance = arm.body.reach * rng.random_range(0.5..1.8);
+            let yaw = rng.random_range(0.0..TAU);
+            let height = if rng.random_bool(0.7) {
+                0.0
+            } else {
+                rng.random_range(-0.3..0.3)
+            };
+            let place = DAffine3::from_rotation_translation(
+                DQuat::from_rotation_z(rng.random_range(0.0..TAU)),
+                DVec3::new(distance * yaw.cos(), distance * yaw.sin(), height),
+            );
+            arm.poses.iter_mut().for_each(|pose| *pose = place * *pose);
+            let own = arm.body.robot.spine(&arm.poses);
+            let clear = own
+                .windows(2)
+                .flat_map(|ends| [ends[0], 0.5 * (ends[0] + ends[1])])
+                .all(|point| line_distance(&spine, point) > 0.2);
+            let near = camera.transform_point3(arm.base()).z < 0.6;
+            let seen = clear && !near && arm.in_view(camera, window) >= Some(1);
+            let share = if seen {
+                self.coverage(camera, &arm, window)
+            } else {
+                0.0
+            };
+            (share > 0.004 && share < largest).then_some(arm)
+        })
     }
 
     /// The share of the picture that the robot covers, from its collision meshes at a quarter of the
     /// resolution.
-    fn coverage(&self, camera_from_base: DAffine3, poses: &[DAffine3]) -> f64 {
+    fn coverage(&self, camera_from_base: DAffine3, arm: &Arm, window: &Window) -> f64 {
         const STEP: f32 = 4.0;
         const COLUMNS: usize = (WIDTH / 4) as usize;
         const ROWS: usize = (HEIGHT / 4) as usize;
         let mut covered = vec![false; COLUMNS * ROWS];
         let k = INTRINSICS;
         let (f, cx, cy) = ((k.fx as f32) / STEP, k.cx as f32 / STEP, k.cy as f32 / STEP);
-        for &(link, mesh) in &self.shadow {
-            let (Some(&pose), Some(mesh)) = (poses.get(link), self.meshes.get(mesh)) else {
+        for &(link, mesh) in &arm.body.shadow {
+            let (Some(&pose), Some(mesh)) = (arm.poses.get(link), self.meshes.get(mesh)) else {
                 continue;
             };
             let map = camera_from_base * pose;
@@ -469,78 +552,67 @@ impl Stage {
                 }
             }
         }
-        covered.iter().filter(|&&c| c).count() as f64 / covered.len() as f64
+        let seen = (0..).zip(&covered).filter(|&(i, &c)| {
+            let pixel = [i % COLUMNS, i / COLUMNS].map(|c| STEP as u32 * c as u32);
+            c && window.contains(pixel)
+        });
+        seen.count() as f64 / covered.len() as f64
     }
 
-    fn empty_shot(
-        &self,
-        support: Support,
-        look: &mut ChaCha8Rng,
-        rng: &mut ChaCha8Rng,
-        photos: usize,
-    ) -> Shot {
+    /// A camera for a picture without a robot.
+    fn look_around(&self, support: &Support, rng: &mut ChaCha8Rng) -> DAffine3 {
         let aim = DVec3::new(0.0, 0.0, rng.random_range(0.0..0.5));
         let direction = direction(rng, support.lowest_camera(), PI / 3.0);
-        let roll = rng.random_range(-10f64..10.0).to_radians();
+        let roll = any_roll(rng);
         let pixel = [
             INTRINSICS.cx + rng.random_range(-120.0..120.0),
             INTRINSICS.cy + rng.random_range(-100.0..100.0),
         ];
-        let distance = self.reach * rng.random_range(0.7..2.2);
-        let camera = look_at(aim, direction, distance, roll, pixel);
-        self.dress(camera, support, None, look, rng, photos)
+        let distance = self.main.reach * rng.random_range(0.7..3.0);
+        look_at(aim, direction, distance, roll, pixel)
     }
 
-    /// Puts everything into a shot. `look` draws what a recording with a fixed camera keeps: support, colours, tool.
+    /// Puts everything into a shot. `arms`: the robot, then others. `look` draws what a recording with a
+    /// fixed camera keeps: support, colours, tool.
+    #[expect(clippy::too_many_arguments)]
     fn dress(
         &self,
         camera_from_base: DAffine3,
+        window: Window,
         support: Support,
-        robot: Option<(Vec<f64>, Vec<DAffine3>)>,
+        arms: &[Arm],
         look: &mut ChaCha8Rng,
         rng: &mut ChaCha8Rng,
         photos: usize,
     ) -> Shot {
-        let mut build = Builder {
-            items: Vec::new(),
-            camera: camera_from_base.inverse().translation,
-            arm: Vec::new(),
-        };
+        let mut build = Builder::new(camera_from_base);
         let mut centre = DVec3::new(0.0, 0.0, 0.3);
-        let bare = robot.is_none() && look.random_bool(0.4);
+        let bare = arms.is_empty() && look.random_bool(0.4);
         let floor = if bare {
             None
         } else {
             support.build(&mut build, look)
         };
-        if let Some((_, poses)) = &robot {
-            build.arm = self.robot.joint_origins(poses);
-            build.arm.insert(0, DVec3::ZERO);
-            centre = build.arm.iter().sum::<DVec3>() / build.arm.len() as f64;
-            self.add_robot(&mut build, poses, look);
-            if let Some(tool) = self.tool.and_then(|t| poses.get(t)) {
-                build.gripper(*tool, support.is_table(), look);
+        for (n, arm) in arms.iter().enumerate() {
+            if n > 0 {
+                build.plinth(arm.base(), floor, look);
             }
-            if rng.random_bool(0.3) {
-                build.cables(rng);
+            let middle = put_arm(&mut build, arm, &support, look);
+            if n == 0 {
+                centre = middle;
+            }
+            if rng.random_bool(0.5) {
+                build.cables(arm.body.reach, rng);
             }
         }
         build.room(floor, rng);
-        build.clutter(&support, floor, robot.is_none(), rng);
-        if let Some((_, poses)) = &robot
+        build.clutter(&support, floor, arms.is_empty(), rng);
+        build.people(floor.unwrap_or(-0.8), rng);
+        if let Some(arm) = arms.first()
             && rng.random_bool(0.25)
         {
-            build.occluders(&self.robot.joint_origins(poses), rng);
+            build.occluders(&arm.joint_origins(), rng);
         }
-        let posed = robot.map(|(angles, poses)| Posed {
-            angles,
-            joints: self
-                .robot
-                .joint_origins(&poses)
-                .into_iter()
-                .map(|j| camera_from_base.transform_point3(j))
-                .collect(),
-        });
         let texture = PhotoView::any(rng, photos, false);
         let textured = build.items.iter().any(|item| item.material.photo > 0.0);
         Shot {
@@ -552,72 +624,137 @@ impl Stage {
             },
             background: PhotoView::any(rng, photos, true),
             texture: textured.then_some(texture),
-            effects: Effects::any(rng),
-            robot: posed,
+            effects: Effects::any(rng, window),
+            robot: arms.first().map(|arm| arm.posed(camera_from_base)),
+        }
+    }
+}
+
+impl Arm<'_> {
+    /// Whether the arm meets neither itself nor the floor.
+    fn is_free(&self) -> bool {
+        let collision = &self.body.collision;
+        !collision.floor_collision(&self.poses, 0.0) && !collision.self_collision(&self.poses)
+    }
+
+    fn posed(&self, camera_from_base: DAffine3) -> Posed {
+        let joints = self.joint_origins().into_iter();
+        Posed {
+            angles: self.angles.clone(),
+            joints: joints
+                .map(|j| camera_from_base.transform_point3(j))
+                .collect(),
         }
     }
 
-    fn add_robot(&self, build: &mut Builder, poses: &[DAffine3], rng: &mut ChaCha8Rng) {
-        let cap = match rng.random_range(0.0..1.0) {
-            p if p < 0.62 => hsv(
-                rng.random_range(0.52..0.60),
-                rng.random_range(0.18..0.5),
-                rng.random_range(0.6..0.92),
+    fn joints(&self) -> usize {
+        self.body.robot.joints.len()
+    }
+
+    fn base(&self) -> DVec3 {
+        let pose = self.poses.get(self.body.robot.base_link());
+        pose.copied().unwrap_or_default().translation
+    }
+
+    fn joint_origins(&self) -> Vec<DVec3> {
+        self.body.robot.joint_origins(&self.poses)
+    }
+
+    /// How many joints are in the window; `None` where one is not well before the camera.
+    fn in_view(&self, camera_from_base: DAffine3, window: &Window) -> Option<usize> {
+        let mut count = 0;
+        for joint in self.joint_origins() {
+            let joint = camera_from_base.transform_point3(joint);
+            if joint.z < 0.2 {
+                return None;
+            }
+            let [u, v] = INTRINSICS.project(joint.to_array())?;
+            let [left, top, right, bottom] = window.edges();
+            let inside = (left..right - 1.0).contains(&u) && (top..bottom - 1.0).contains(&v);
+            count += usize::from(inside);
+        }
+        Some(count)
+    }
+}
+
+/// Mostly small; now and then a camera that is held askew.
+fn any_roll(rng: &mut ChaCha8Rng) -> f64 {
+    let spread = if rng.random_bool(0.1) { 12.0 } else { 3.5 };
+    (spread * normal(rng)).to_radians()
+}
+
+/// Puts an arm with a tool into a scene; returns its middle.
+fn put_arm(build: &mut Builder, arm: &Arm, support: &Support, look: &mut ChaCha8Rng) -> DVec3 {
+    let spine = arm.body.robot.spine(&arm.poses);
+    let middle = spine.iter().sum::<DVec3>() / spine.len() as f64;
+    build.arms.push(spine);
+    add_robot(build, arm, look);
+    if let Some(tool) = arm.body.tool.and_then(|t| arm.poses.get(t)) {
+        build.gripper(*tool, support.is_table(), look);
+    }
+    middle
+}
+
+fn add_robot(build: &mut Builder, arm: &Arm, rng: &mut ChaCha8Rng) {
+    let cap = match rng.random_range(0.0..1.0) {
+        p if p < 0.65 => hsv(
+            rng.random_range(0.52..0.60),
+            rng.random_range(0.12..0.5),
+            rng.random_range(0.65..0.97),
+        ),
+        p if p < 0.9 => grey(rng, 0.4, 0.9),
+        _ => grey(rng, 0.14, 0.4),
+    };
+    let tube = grey(rng, 0.7, 0.97);
+    let housing = match rng.random_range(0.0..1.0) {
+        p if p < 0.5 => grey(rng, 0.36, 0.62),
+        p if p < 0.85 => grey(rng, 0.6, 0.88),
+        _ => grey(rng, 0.2, 0.38),
+    };
+    let rubber = grey(rng, 0.05, 0.3);
+    let tube_metal = rng.random_range(0.45..1.0);
+    let housing_metal = rng.random_range(0.0..0.7);
+    let gloss = rng.random_range(0.0..1.0f32);
+    for part in &arm.body.visual {
+        let Some(&pose) = arm.poses.get(part.link) else {
+            continue;
+        };
+        let (albedo, metal, specular, shininess) = match part.finish {
+            Finish::Cap => (cap, 0.12 * gloss, 0.05 + 0.35 * gloss, 8.0 + 60.0 * gloss),
+            Finish::Tube => (tube, tube_metal, 0.1 + 0.5 * gloss, 12.0 + 40.0 * gloss),
+            Finish::Housing => (
+                housing,
+                housing_metal,
+                0.05 + 0.35 * gloss,
+                10.0 + 40.0 * gloss,
             ),
-            p if p < 0.87 => grey(rng, 0.38, 0.78),
-            _ => grey(rng, 0.14, 0.36),
+            Finish::Rubber => (rubber, 0.0, 0.04, 8.0),
         };
-        let tube = grey(rng, 0.62, 0.9);
-        let housing = if rng.random_bool(0.8) {
-            grey(rng, 0.4, 0.8)
-        } else {
-            grey(rng, 0.25, 0.45)
+        let shade = rng.random_range(0.93..1.07f32);
+        let material = Material {
+            albedo: albedo.map(|c| (c * shade).clamp(0.0, 1.0)),
+            metal,
+            specular,
+            shininess,
+            ..MATT
         };
-        let rubber = grey(rng, 0.05, 0.3);
-        let tube_metal = rng.random_range(0.15..0.9);
-        let housing_metal = rng.random_range(0.0..0.65);
-        let gloss = rng.random_range(0.0..1.0f32);
-        for part in &self.visual {
-            let Some(&pose) = poses.get(part.link) else {
-                continue;
-            };
-            let (albedo, metal, specular, shininess) = match part.finish {
-                Finish::Cap => (cap, 0.0, 0.05 + 0.25 * gloss, 8.0 + 60.0 * gloss),
-                Finish::Tube => (tube, tube_metal, 0.1 + 0.4 * gloss, 12.0 + 40.0 * gloss),
-                Finish::Housing => (
-                    housing,
-                    housing_metal,
-                    0.05 + 0.3 * gloss,
-                    10.0 + 40.0 * gloss,
-                ),
-                Finish::Rubber => (rubber, 0.0, 0.04, 8.0),
-            };
-            let shade = rng.random_range(0.93..1.07f32);
-            let material = Material {
-                albedo: albedo.map(|c| (c * shade).clamp(0.0, 1.0)),
-                metal,
-                specular,
-                shininess,
-                ..MATT
-            };
-            build.items.push(Item {
-                mesh: part.mesh,
-                base_from_mesh: pose,
-                material,
-                kind: Kind::Robot,
-            });
-        }
-        for &(link, mesh) in &self.shadow {
-            let Some(&pose) = poses.get(link) else {
-                continue;
-            };
-            build.items.push(Item {
-                mesh,
-                base_from_mesh: pose,
-                material: MATT,
-                kind: Kind::Shadow,
-            });
-        }
+        build.items.push(Item {
+            mesh: part.mesh,
+            base_from_mesh: pose,
+            material,
+            kind: Kind::Robot,
+        });
+    }
+    for &(link, mesh) in &arm.body.shadow {
+        let Some(&pose) = arm.poses.get(link) else {
+            continue;
+        };
+        build.items.push(Item {
+            mesh,
+            base_from_mesh: pose,
+            material: MATT,
+            kind: Kind::Shadow,
+        });
     }
 }
 

@@ -159,7 +159,7 @@ class Network(nn.Module):
                 self.add_module(name, nn.Conv2d(
                     channels, layer["out_channels"], kernel, dilation=dilation, padding=dilation * (kernel - 1) // 2))
                 if normalise and layer["activation"] == "relu":
-                    self.add_module(f"{name}_norm", nn.BatchNorm2d(layer["out_channels"]))
+                    self.add_module(f"{name}_norm", nn.BatchNorm2d(layer["out_channels"], momentum=0.03))
                 shapes[name] = (layer["out_channels"], *size)
             elif op == "max_pool2d":
                 shapes[name] = (channels, *(extent // layer["size"] for extent in size))
