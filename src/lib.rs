@@ -6,6 +6,8 @@ pub mod cascade;
 #[cfg(feature = "cli")]
 pub mod cli;
 pub mod draw;
+#[cfg(feature = "recording")]
+pub mod evaluation;
 pub mod gpu;
 pub mod network;
 #[cfg(feature = "recording")]

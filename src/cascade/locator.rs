@@ -62,6 +62,14 @@ pub enum LocateError {
         /// Rows of the image.
         height: u32,
     },
+    /// A mask that is not of the model's size.
+    #[error("mask: expected {expected} values, found {found}")]
+    Mask {
+        /// Pixels of the network's image.
+        expected: usize,
+        /// Values in the mask.
+        found: usize,
+    },
     /// The networks do not fit together: a defect of this library.
     #[error("{0}: a layer's shape differs from its description")]
     Shape(&'static str),
@@ -116,6 +124,62 @@ impl Locator {
         camera: &Camera,
         output: Output,
     ) -> Result<Estimate, LocateError> {
+        let view = self.view(image, camera)?;
+        let rectification = view.rectification;
+        let frame = match &mut self.engine {
+            Engine::Gpu { device, plan } => {
+                plan.write(device, 0, image, &rectification)?;
+                plan.run(device, !output.mask_only, output.mask)?
+                    .pop()
+                    .ok_or(LocateError::Shape("batch"))?
+            }
+            Engine::Cpu { model } => run_reference(model, image, &rectification, output)?,
+        };
+        Ok(self.estimate(frame, &view, output))
+    }
+
+    /// Where the joint network puts the joints of the robot that `mask` shows in `image`: what it makes
+    /// of a better mask than the mask network's, or of a mask in which too little is sure. As it says
+    /// so, also where that cannot be: in the model's order, camera optical frame, metres.
+    ///
+    /// # Errors
+    /// As [`Locator::locate`], and a mask of another size than the model's.
+    pub fn joints_with_mask(
+        &mut self,
+        image: &RgbaImage,
+        camera: &Camera,
+        mask: &Mask,
+    ) -> Result<Vec<[f64; 3]>, LocateError> {
+        let rectification = self.view(image, camera)?.rectification;
+        let input = self.description.input;
+        let (expected, found) = (
+            input.width as usize * input.height as usize,
+            mask.probability.len(),
+        );
+        if expected != found {
+            return Err(LocateError::Mask { expected, found });
+        }
+        let values = match &mut self.engine {
+            Engine::Gpu { device, plan } => {
+                plan.write(device, 0, image, &rectification)?;
+                plan.run_with_masks(device, &mask.probability)?
+                    .pop()
+                    .ok_or(LocateError::Shape("batch"))?
+            }
+            Engine::Cpu { model } => {
+                let shape = model.mask_network.output();
+                let image = reference::rectify(image, &rectification, shape.height, shape.width);
+                let mask = reference::Tensor::new(shape, mask.probability.clone())
+                    .ok_or(LocateError::Shape("mask network"))?;
+                reference_joints(model, &image, &mask)?
+            }
+        };
+        let joints = values.as_chunks().0.iter();
+        Ok(joints.map(|xyz: &[f32; 3]| xyz.map(f64::from)).collect())
+    }
+
+    /// What the networks see of `image`, taken by `camera`.
+    fn view(&mut self, image: &RgbaImage, camera: &Camera) -> Result<View, LocateError> {
         let (width, height) = image.dimensions();
         if (width, height) != (camera.width, camera.height) {
             return Err(LocateError::Size {
@@ -132,17 +196,7 @@ impl Locator {
             _ => View::new(camera, &canonical, input.width, input.height),
         };
         self.view = Some(view);
-        let rectification = view.rectification;
-        let frame = match &mut self.engine {
-            Engine::Gpu { device, plan } => {
-                plan.write(device, 0, image, &rectification)?;
-                plan.run(device, !output.mask_only, output.mask)?
-                    .pop()
-                    .ok_or(LocateError::Shape("batch"))?
-            }
-            Engine::Cpu { model } => run_reference(model, image, &rectification, output)?,
-        };
-        Ok(self.estimate(frame, &view, output))
+        Ok(view)
     }
 
     /// What a frame of the networks says about the image as given.
@@ -212,11 +266,7 @@ fn run_reference(
     let joints = if output.mask_only {
         Vec::new()
     } else {
-        let masked = reference::overlay(&image, &mask, description.overlay);
-        reference::run(&model.joint_network, &masked)
-            .ok_or(LocateError::Shape("joint network"))?
-            .data()
-            .to_vec()
+        reference_joints(model, &image, &mask)?
     };
     Ok(Frame {
         coverage,
@@ -227,4 +277,15 @@ fn run_reference(
             Vec::new()
         },
     })
+}
+
+fn reference_joints(
+    model: &Model,
+    image: &reference::Tensor,
+    mask: &reference::Tensor,
+) -> Result<Vec<f32>, LocateError> {
+    let masked = reference::overlay(image, mask, model.description.overlay);
+    let joints =
+        reference::run(&model.joint_network, &masked).ok_or(LocateError::Shape("joint network"))?;
+    Ok(joints.data().to_vec())
 }

@@ -124,7 +124,7 @@ fn expand(inputs: &[PathBuf]) -> Vec<(PathBuf, anyhow::Result<()>)> {
     images
 }
 
-fn progress_bar(images: usize) -> ProgressBar {
+pub(super) fn progress_bar(images: usize) -> ProgressBar {
     if images < 2 || !io::stderr().is_terminal() {
         return ProgressBar::hidden();
     }
@@ -145,10 +145,7 @@ struct Engine {
 
 impl Engine {
     fn new(args: &Args) -> anyhow::Result<Self> {
-        let on_cpu = args
-            .adapter
-            .as_deref()
-            .is_some_and(|name| name.eq_ignore_ascii_case("cpu"));
+        let on_cpu = is_cpu(args.adapter.as_deref());
         let request = AdapterRequest::new(args.adapter.as_deref(), args.backend.as_deref());
         let device = if on_cpu { None } else { open(&request)? };
         let model = weights::load(args.robot.as_deref(), args.weights.as_deref())?;
@@ -175,8 +172,13 @@ impl Engine {
     }
 }
 
+/// Whether `--adapter` asks for none.
+pub(super) fn is_cpu(adapter: Option<&str>) -> bool {
+    adapter.is_some_and(|name| name.eq_ignore_ascii_case("cpu"))
+}
+
 /// `None` where there is no adapter and none was asked for.
-fn open(request: &AdapterRequest) -> Result<Option<Arc<Device>>, GpuError> {
+pub(super) fn open(request: &AdapterRequest) -> Result<Option<Arc<Device>>, GpuError> {
     match Device::open(request) {
         Ok(device) => Ok(Some(Arc::new(device))),
         Err(error @ GpuError::NoAdapter { .. }) if *request == AdapterRequest::default() => {
@@ -187,7 +189,8 @@ fn open(request: &AdapterRequest) -> Result<Option<Arc<Device>>, GpuError> {
     }
 }
 
-fn locator(model: &Model, device: Option<&Arc<Device>>) -> Result<Locator, LocateError> {
+/// `model` on `device`, or in plain Rust.
+pub(super) fn locator(model: &Model, device: Option<&Arc<Device>>) -> Result<Locator, LocateError> {
     match device {
         Some(device) => Locator::on_gpu(Arc::clone(device), model),
         None => Ok(Locator::on_cpu(model)),
@@ -197,7 +200,7 @@ fn locator(model: &Model, device: Option<&Arc<Device>>) -> Result<Locator, Locat
 /// Where a camera's intrinsics come from.
 #[derive(Debug, Clone, Copy, Serialize)]
 #[serde(rename_all = "snake_case")]
-enum IntrinsicsSource {
+pub(super) enum IntrinsicsSource {
     CameraInfo,
     Hfov,
     Exif,
@@ -278,7 +281,7 @@ fn milliseconds(since: Instant) -> f64 {
     rounded(since.elapsed().as_secs_f64() * 1e3, 2)
 }
 
-fn camera_of(
+pub(super) fn camera_of(
     photo: &Photo,
     calibrated: Option<Camera>,
     hfov: Option<f64>,

@@ -1,6 +1,7 @@
 //! The command line: one file a command.
 
 mod adapters;
+mod evaluate;
 mod info;
 mod locate;
 mod photo;
@@ -22,6 +23,7 @@ enum Command {
     Adapters(adapters::Args),
     Info(info::Args),
     Record(record::Args),
+    Evaluate(evaluate::Args),
     #[command(subcommand)]
     Recording(recording::Args),
 }
@@ -40,6 +42,7 @@ pub fn main() -> ExitCode {
         Command::Adapters(args) => adapters::run(&args),
         Command::Info(args) => info::run(&args),
         Command::Record(args) => record::run(args),
+        Command::Evaluate(args) => evaluate::run(&args),
         Command::Recording(args) => recording::run(&args),
     };
     done.unwrap_or_else(|error| {

@@ -1,9 +1,17 @@
-//! Pictures for people: masks, tinted overlays, joints drawn along the arm.
+//! Pictures for people: masks, tinted overlays, joints drawn along the arm, charts and sheets of pictures.
 
 #[cfg(feature = "cli")]
 mod annotated;
+#[cfg(feature = "cli")]
+mod chart;
 mod mask;
+#[cfg(feature = "cli")]
+mod sheet;
 
 #[cfg(feature = "cli")]
 pub use annotated::{JOINT_COLOURS, annotated};
+#[cfg(feature = "cli")]
+pub use chart::{BarChart, BarGroup, ChartError, Line, LineChart, bar_charts, line_charts};
 pub use mask::mask_image;
+#[cfg(feature = "cli")]
+pub use sheet::{SheetRow, sheet};

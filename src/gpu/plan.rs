@@ -142,21 +142,17 @@ impl Plan {
 
         let shape = self.image.shape;
         let (width, height) = (shape.width as u32, shape.height as u32);
-        let (totals_size, joints_size) = (size_of::<Totals>(), 16 * blocks(self.joint_values));
         let mut frames = device.read(&self.results, |bytes| {
             let (all_totals, all_joints) = bytes.split_at(totals as usize);
+            let joints = self.joints_in(all_joints);
             all_totals
-                .chunks_exact(totals_size)
-                .zip(all_joints.chunks_exact(joints_size))
-                .map(|(totals, joints)| {
-                    let mut joints = bytemuck::pod_collect_to_vec::<u8, f32>(joints);
-                    joints.truncate(if with_joints { self.joint_values } else { 0 });
-                    Frame {
-                        coverage: bytemuck::pod_read_unaligned::<Totals>(totals)
-                            .coverage(width, height),
-                        joints,
-                        mask: Vec::new(),
-                    }
+                .chunks_exact(size_of::<Totals>())
+                .zip(joints)
+                .map(|(totals, joints)| Frame {
+                    coverage: bytemuck::pod_read_unaligned::<Totals>(totals)
+                        .coverage(width, height),
+                    joints: if with_joints { joints } else { Vec::new() },
+                    mask: Vec::new(),
                 })
                 .collect::<Vec<_>>()
         })?;
@@ -173,5 +169,44 @@ impl Plan {
             }
         }
         Ok(frames)
+    }
+
+    /// Runs the joint network behind `masks` `[image][row][column]`, in [0, 1], in place of what the
+    /// mask network says, and waits for it: the [`Frame::joints`] of each image of the batch.
+    ///
+    /// # Errors
+    /// As [`Device::wait`], and another number of values.
+    pub fn run_with_masks(
+        &self,
+        device: &Device,
+        masks: &[f32],
+    ) -> Result<Vec<Vec<f32>>, GpuError> {
+        self.mask.output().write(device, masks)?;
+        let mut encoder = device.wgpu().create_command_encoder(&Default::default());
+        let mut pass = encoder.begin_compute_pass(&Default::default());
+        for rectify in &self.rectify {
+            rectify.encode(&mut pass);
+        }
+        self.overlay.encode(&mut pass);
+        self.joint.encode(&mut pass);
+        drop(pass);
+        let joints = &self.joint.output().buffer;
+        let totals = self.totals.size();
+        encoder.copy_buffer_to_buffer(joints, 0, &self.results, totals, joints.size());
+        device.queue().submit([encoder.finish()]);
+        device.read(&self.results, |bytes| {
+            let (_, joints) = bytes.split_at(totals as usize);
+            self.joints_in(joints).collect()
+        })
+    }
+
+    /// Each image's joints in the joint network's output as it lies in memory.
+    fn joints_in<'a>(&self, bytes: &'a [u8]) -> impl Iterator<Item = Vec<f32>> + use<'a> {
+        let count = self.joint_values;
+        bytes.chunks_exact(16 * blocks(count)).map(move |joints| {
+            let mut joints = bytemuck::pod_collect_to_vec::<u8, f32>(joints);
+            joints.truncate(count);
+            joints
+        })
     }
 }
