@@ -16,8 +16,8 @@ fn root(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
 }
 
-fn model() -> Model {
-    Model::load(root("weights/ur5.safetensors")).unwrap()
+fn model(robot: &str) -> Model {
+    Model::load(root(&format!("weights/{robot}.safetensors"))).unwrap()
 }
 
 fn camera() -> Camera {
@@ -30,7 +30,14 @@ fn sample(name: &str) -> RgbaImage {
         .into_rgba8()
 }
 
-const ROBOTS: [&str; 6] = ["ur5_1", "ur5_2", "ur5_3", "ur5_4", "ur5_5", "ur5_6"];
+const ROBOTS: [(&str, &[&str]); 3] = [
+    ("ur3", &["ur3_1", "ur3_2"]),
+    (
+        "ur5",
+        &["ur5_1", "ur5_2", "ur5_3", "ur5_4", "ur5_5", "ur5_6"],
+    ),
+    ("ur10", &["ur10_1", "ur10_2"]),
+];
 const WITH_MASK: Output = Output {
     mask: true,
     mask_only: false,
@@ -59,7 +66,7 @@ fn every_file_in_weights_loads() {
 
 #[test]
 fn gpu_and_reference_agree_on_photos() {
-    let model = model();
+    let model = model("ur5");
     let mut gpu = Locator::on_gpu(device(), &model).unwrap();
     let mut cpu = Locator::on_cpu(&model);
     let mut first = None;
@@ -93,60 +100,63 @@ fn iou(a: &[bool], b: &[bool]) -> f64 {
 
 #[test]
 fn the_robot_is_found_where_it_is() {
-    let model = model();
-    let mut locator = Locator::on_gpu(device(), &model).unwrap();
     let truth: serde_json::Value =
         serde_json::from_slice(&std::fs::read(root("tests/data/samples/truth.json")).unwrap())
             .unwrap();
-    let (mut total_iou, mut total_error) = (0.0, 0.0);
-    let mut wrong_iou = 0.0;
+    let robot = |mask: &image::GrayImage| mask.iter().map(|&v| v > 0).collect::<Vec<_>>();
     let mut before: Option<Vec<bool>> = None;
-    for name in ROBOTS {
-        let estimate = locator.locate(&sample(name), &camera(), WITH_MASK).unwrap();
-        assert_eq!(estimate.status, Status::Found, "{name}");
-        let found = draw::mask_image(
-            estimate.mask.as_ref().unwrap(),
-            &model.description.camera,
-            &camera(),
-            Some(model.description.presence.mask_threshold),
-        );
-        let expected = image::open(root(&format!("tests/data/samples/{name}.mask.png")))
-            .unwrap()
-            .into_luma8();
-        let robot = |mask: &image::GrayImage| mask.iter().map(|&v| v > 0).collect::<Vec<_>>();
-        let (found, expected) = (robot(&found), robot(&expected));
-        let errors: Vec<f64> = estimate
-            .joints
-            .iter()
-            .enumerate()
-            .map(|(index, joint)| {
-                let at = |axis: usize| truth[name]["joints_m"][index][axis].as_f64().unwrap();
-                (0..3)
-                    .map(|axis| (joint.xyz_m[axis] - at(axis)).powi(2))
-                    .sum::<f64>()
-                    .sqrt()
-            })
-            .collect();
-        let error = errors.iter().sum::<f64>() / errors.len() as f64;
-        println!(
-            "{name}: IoU {:.3}, joints off by {:.1} cm",
-            iou(&found, &expected),
-            100.0 * error
-        );
-        total_iou += iou(&found, &expected) / ROBOTS.len() as f64;
-        total_error += error / ROBOTS.len() as f64;
-        wrong_iou += before.map_or(0.0, |other| iou(&other, &expected)) / ROBOTS.len() as f64;
-        before = Some(found);
+    for (name, images) in ROBOTS {
+        let model = model(name);
+        let mut locator = Locator::on_gpu(device(), &model).unwrap();
+        let (mut total_iou, mut total_error) = (0.0, 0.0);
+        for image in images {
+            let estimate = locator
+                .locate(&sample(image), &camera(), WITH_MASK)
+                .unwrap();
+            assert_eq!(estimate.status, Status::Found, "{image}");
+            let found = draw::mask_image(
+                estimate.mask.as_ref().unwrap(),
+                &model.description.camera,
+                &camera(),
+                Some(model.description.presence.mask_threshold),
+            );
+            let expected = image::open(root(&format!("tests/data/samples/{image}.mask.png")))
+                .unwrap()
+                .into_luma8();
+            let (found, expected) = (robot(&found), robot(&expected));
+            let error = estimate
+                .joints
+                .iter()
+                .enumerate()
+                .map(|(index, joint)| {
+                    let at = |axis: usize| truth[*image]["joints_m"][index][axis].as_f64().unwrap();
+                    (0..3)
+                        .map(|axis| (joint.xyz_m[axis] - at(axis)).powi(2))
+                        .sum::<f64>()
+                        .sqrt()
+                })
+                .sum::<f64>()
+                / estimate.joints.len() as f64;
+            let overlap = iou(&found, &expected);
+            println!(
+                "{image}: IoU {overlap:.3}, joints off by {:.1} cm",
+                100.0 * error
+            );
+            total_iou += overlap / images.len() as f64;
+            total_error += error / images.len() as f64;
+            // Negative control: the mask of the picture before does not pass.
+            if let Some(other) = before.replace(found) {
+                assert!(iou(&other, &expected) < 0.45, "{image}");
+            }
+        }
+        assert!(total_iou >= 0.6, "{name}: {total_iou}");
+        assert!(total_error <= 0.25, "{name}: {total_error}");
     }
-    assert!(total_iou >= 0.6, "{total_iou}");
-    assert!(total_error <= 0.25, "{total_error}");
-    // Negative control: the mask of the picture before does not pass.
-    assert!(wrong_iou < 0.4, "{wrong_iou}");
 }
 
 #[test]
 fn without_a_robot_nothing_is_found() {
-    let mut locator = Locator::on_gpu(device(), &model()).unwrap();
+    let mut locator = Locator::on_gpu(device(), &model("ur5")).unwrap();
     let estimate = locator
         .locate(&sample("no_robot"), &camera(), WITH_MASK)
         .unwrap();
