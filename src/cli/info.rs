@@ -167,7 +167,11 @@ fn outline(text: &mut String, key: &str, value: &Value, depth: usize) {
         Value::String(s) => s.clone(),
         other => other.to_string(),
     };
-    let nested = |value: &Value| value.is_object() || value.is_array();
+    // A curve's points stay in one line.
+    let nested = |value: &Value| match value {
+        Value::Array(items) => items.iter().any(|v| v.is_object() || v.is_array()),
+        other => other.is_object(),
+    };
     match value {
         Value::Object(entries) => {
             *text += &format!("{indent}{key}:\n");
