@@ -128,6 +128,8 @@ def main(argv=None):
                         help="recordings trained on: figures on the fifth of them that is kept for testing")
     command.add_argument("--validation-samples", type=int, default=100, metavar="N",
                          help="choose on N samples, the ones training validated on, and report on others (%(default)s)")
+    command.add_argument("--robot", metavar="NAME", help="whose file it is, where the recordings are of several; theirs all"
+                         " choose the presence threshold")
     command.add_argument("--out", required=True, metavar="FILE")
     command.add_argument("--dtype", choices=("f32", "f16"), default="f32", help="of the tensors (%(default)s)")
     command.add_argument("--note", default="", metavar="TEXT", help="what the card is to say about the data")

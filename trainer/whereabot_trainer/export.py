@@ -43,19 +43,25 @@ def export_runs(args):
     rule = joint_state["card"]["overlay"]
 
     samples = data.Samples(args.validation or args.recording, args.cache)
-    if len(set(samples.robots)) > 1:
-        raise SystemExit(f"expected recordings of one robot, found {', '.join(sorted(set(samples.robots)))}")
-    arm = float(samples.arms[0])
+    robots = sorted(set(samples.robots))
+    robot = args.robot or robots[0]
+    if robot not in robots or (len(robots) > 1 and not args.robot):
+        raise SystemExit(f"--robot: expected one of {', '.join(robots)}, found {args.robot or 'none'}")
+    own = samples.robots == robot
+    arm = float(samples.arms[own][0])
     output_unit(joint_state["card"]).fold(joint, arm)
-    # What presence is chosen on is not reported on.
+    # What presence is chosen on is not reported on. It is chosen on all robots: the mask network may be, and a recording
+    # has few images without one.
     if args.validation:
         order = np.random.default_rng(args.seed).permutation(len(samples))
         chosen, reported = order[: args.validation_samples], np.sort(order[args.validation_samples :])
-        if len(reported) < args.validation_samples:
-            raise SystemExit(f"expected more than {2 * args.validation_samples - 1} samples to validate on, found"
-                             f" {len(samples)}: give more, or a smaller --validation-samples")
+        reported = reported[own[reported]]
+        if not len(reported):
+            raise SystemExit(f"expected more than {args.validation_samples} samples to validate on, found {len(samples)}:"
+                             " give more, or a smaller --validation-samples")
     else:
         training, reported = data.split(samples)
+        reported = reported[own[reported]]
         chosen = np.random.default_rng(args.seed).permutation(training)[: args.validation_samples]
     order = np.union1d(chosen, reported)
 
@@ -70,13 +76,13 @@ def export_runs(args):
         {threshold: shares(chosen[kind[chosen]], threshold) for threshold in SURE_THRESHOLDS}
         for kind in (seen, empty)))
 
-    robots = reported[seen[reported]]
+    shown = reported[seen[reported]]
     measured = evaluate.score_mask(mask, samples, reported, args.device)
     figures = {name: measured[name] for name in ("accuracy", "iou", "precision", "recall")}
     for name, masks in (("true_mask", None), ("estimated_mask", estimated)):
         figures |= evaluate.score_joints(
-            joint, evaluate.identity_metres, samples, robots, masks, rule, args.device, name)
-    found = robots[np.asarray(shares(robots, sure)) >= least]
+            joint, evaluate.identity_metres, samples, shown, masks, rule, args.device, name)
+    found = shown[np.asarray(shares(shown, sure)) >= least]
     if len(found):
         figures |= evaluate.score_joints(
             joint, evaluate.identity_metres, samples, found, estimated, rule, args.device, "found_estimated_mask")
@@ -85,7 +91,7 @@ def export_runs(args):
         figures["presence"] |= {
             f"{part}_robots_found": _rate(value >= least for value in shares(numbers[seen[numbers]], sure)),
             f"{part}_without_robot_rejected": _rate(value < least for value in shares(numbers[empty[numbers]], sure))}
-    figures["samples"] = {"chosen_on": len(chosen), "reported_on": len(reported), "with_robot": len(robots)}
+    figures["samples"] = {"chosen_on": len(chosen), "reported_on": len(reported), "with_robot": len(shown)}
 
     card = {
         "task": "mask and joints (metres, camera optical frame) of one robot arm in one colour image",
@@ -99,7 +105,7 @@ def export_runs(args):
         "licence": args.licence,
     }
     description = describe(
-        mask.layers, joint.layers, family=mask_state["card"]["family"], robot=str(samples.robots[0]), overlay=rule,
+        mask.layers, joint.layers, family=mask_state["card"]["family"], robot=robot, overlay=rule,
         presence={"mask_threshold": 0.5, "sure_threshold": sure, "min_sure": least}, card=card)
     write_model(args.out, mask, joint, description, args.dtype)
     print(json.dumps({"chosen": description["presence"], "figures": figures}, indent=1))

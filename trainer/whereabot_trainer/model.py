@@ -2,10 +2,11 @@
 
 import json
 import os
+from pathlib import Path
 
 import torch
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from .networks import CAMERA, INPUT_HEIGHT, INPUT_WIDTH, JOINT_INPUT, JOINTS, MASK_INPUT, Network
 
@@ -34,7 +35,7 @@ def write_model(path, mask, joint, description, dtype="f32"):
             tensors[f"{prefix}.{key}"] = tensor.contiguous(memory_format=torch.contiguous_format)
     # A reader must never see half a file: write beside it, then rename.
     partial = f"{path}.partial"
-    save_file(tensors, partial, metadata={"whereabot": json.dumps(description)})
+    Path(partial).write_bytes(save(tensors, metadata={"whereabot": json.dumps(description)}))
     os.replace(partial, path)
 
 

@@ -60,9 +60,11 @@ def steps(args):
             joint(f"joint-{robot}", f"mask-{robot}", [robot], (1 - MASK) * args.minutes / len(robots))
     for robot in robots:
         mask = "mask" if shared else f"mask-{robot}"
-        source = ["--validation", *by_robot[robot][1]] if by_robot[robot][1] else ["--recording", *by_robot[robot][0]]
+        of = robots if shared else [robot]
+        held_out = [folder for name in of for folder in by_robot[name][1]]
+        source = ["--validation", *held_out] if by_robot[robot][1] else ["--recording", *by_robot[robot][0]]
         commands.append(["export", "--mask", str(out / mask), "--joint", str(out / f"joint-{robot}"), *source,
-                         "--cache", args.cache, "--out", str(out / f"{robot}.safetensors"), "--dtype", args.dtype])
+                         "--robot", robot, "--cache", args.cache, "--out", str(out / f"{robot}.safetensors"), "--dtype", args.dtype])
     return commands
 
 
