@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{description, device, difference, model_file, noise};
+use common::{description, device, difference, joints, model_file, noise};
 use image::RgbaImage;
 use whereabot::camera::{Camera, Rectification};
 use whereabot::cascade::{Estimate, Locator, Output, Status};
@@ -42,14 +42,6 @@ fn picture(width: u32, height: u32, seed: u64) -> RgbaImage {
 
 fn mask(estimate: &Estimate) -> &[f32] {
     &estimate.mask.as_ref().unwrap().probability
-}
-
-fn joints(estimate: &Estimate) -> Vec<f32> {
-    estimate
-        .joints
-        .iter()
-        .flat_map(|j| j.xyz_m.map(|v| v as f32))
-        .collect()
 }
 
 #[test]

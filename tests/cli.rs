@@ -2,33 +2,15 @@
 #![cfg(feature = "cli")]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
-use std::collections::HashMap;
+mod known;
+
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
 use image::{DynamicImage, GrayImage, ImageFormat, Luma, Rgb, RgbImage};
-use safetensors::tensor::{Dtype, TensorView};
+use known::{JOINTS, XYZ, command, model};
 use serde_json::{Value, json};
 use tempfile::TempDir;
-
-const JOINTS: [&str; 6] = [
-    "shoulder_pan",
-    "shoulder_lift",
-    "elbow",
-    "wrist_1",
-    "wrist_2",
-    "wrist_3",
-];
-
-/// Where the test model says that the joints are, whatever the image.
-const XYZ: [[f32; 3]; 6] = [
-    [-0.25, 0.25, 2.0],
-    [-0.2, 0.1, 2.0],
-    [0.0, -0.2, 1.9],
-    [0.1, -0.1, 1.8],
-    [0.2, 0.0, 1.7],
-    [0.25, 0.05, 1.6],
-];
 
 const WHITE: [u8; 3] = [255; 3];
 const BLACK: [u8; 3] = [0; 3];
@@ -44,11 +26,12 @@ impl Bench {
         Self::with_joints(XYZ)
     }
 
-    fn with_joints(xyz: [[f32; 3]; 6]) -> Self {
+    fn with_joints(xyz: [[f64; 3]; 6]) -> Self {
         let bench = Self {
             folder: tempfile::tempdir().unwrap(),
         };
-        std::fs::write(bench.path("model.safetensors"), model(xyz)).unwrap();
+        let card = json!({"figures": {"mask_iou": 0.5}});
+        bench.write("model.safetensors", &model("cube", xyz, 0.0, &card));
         bench
     }
 
@@ -66,17 +49,7 @@ impl Bench {
     }
 
     fn command(&self) -> Command {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_whereabot"));
-        command.current_dir(self.folder.path());
-        for variable in [
-            "WGPU_BACKEND",
-            "WGPU_ADAPTER_NAME",
-            "WHEREABOT_WEIGHTS",
-            "RUST_LOG",
-        ] {
-            command.env_remove(variable);
-        }
-        command
+        command(self.folder.path())
     }
 
     /// `locate --json` in plain Rust: the lines and the exit code.
@@ -108,47 +81,6 @@ impl Bench {
     fn picture(&self, path: &Value) -> DynamicImage {
         image::open(self.path(path.as_str().unwrap())).unwrap()
     }
-}
-
-/// 16 x 12 pixels with a right angle of view. The mask network is `sigmoid(20 red - 10)`; the joint
-/// network is the bias of its dense layer.
-fn model(xyz: [[f32; 3]; 6]) -> Vec<u8> {
-    let description = json!({
-        "version": 1,
-        "family": "paper",
-        "robot": "cube",
-        "joints": JOINTS,
-        "input": {"width": 16, "height": 12},
-        "camera": {"fx": 8.0, "fy": 8.0, "cx": 7.5, "cy": 5.5},
-        "mask_network": {"layers": [
-            {"name": "conv1", "op": "conv2d", "inputs": ["image"], "out_channels": 1, "kernel": 1,
-             "dilation": 1, "activation": "sigmoid"}]},
-        "overlay": {"rule": "multiply"},
-        "joint_network": {"layers": [
-            {"name": "pool1", "op": "max_pool2d", "inputs": ["overlay"], "size": 4},
-            {"name": "dense", "op": "dense", "inputs": ["pool1"], "out_features": 18,
-             "activation": "none"}]},
-        "presence": {"mask_threshold": 0.5, "sure_threshold": 0.7, "min_sure": 0.01},
-        "card": {"figures": {"mask_iou": 0.5}},
-    });
-    let bytes =
-        |values: &[f32]| -> Vec<u8> { values.iter().flat_map(|v| v.to_le_bytes()).collect() };
-    let tensors = [
-        (
-            "mask.conv1.weight",
-            vec![1, 3, 1, 1],
-            bytes(&[20.0, 0.0, 0.0]),
-        ),
-        ("mask.conv1.bias", vec![1], bytes(&[-10.0])),
-        ("joint.dense.weight", vec![18, 36], bytes(&[0.0; 18 * 36])),
-        ("joint.dense.bias", vec![18], bytes(xyz.as_flattened())),
-    ];
-    let views = tensors.iter().map(|(name, shape, data)| {
-        let view = TensorView::new(Dtype::F32, shape.clone(), data).unwrap();
-        (*name, view)
-    });
-    let metadata = HashMap::from([("whereabot".to_owned(), description.to_string())]);
-    safetensors::serialize(views, Some(metadata)).unwrap()
 }
 
 fn encoded(image: &DynamicImage, format: ImageFormat) -> Vec<u8> {
@@ -266,7 +198,7 @@ fn a_robot_is_found_and_told_as_one_line_of_json() {
         .zip(JOINTS.iter().zip(XYZ))
     {
         assert_eq!(&joint["name"], name);
-        let [x, y, z] = xyz.map(f64::from);
+        let [x, y, z] = xyz;
         for (found, expected) in joint["xyz_m"].as_array().unwrap().iter().zip([x, y, z]) {
             assert!(close(found, expected, 1e-4), "{joint}");
         }

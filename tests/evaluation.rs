@@ -3,14 +3,13 @@
 #![allow(clippy::unwrap_used, clippy::panic, missing_docs)]
 
 mod common;
+mod known;
 
-use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-use assert_cmd::Command;
 use common::{description, device, difference, model_file, noise};
 use image::{GrayImage, Luma, Rgb, RgbImage, RgbaImage};
-use safetensors::tensor::{Dtype, TensorView};
+use known::{JOINTS, XYZ, command};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 use whereabot::camera::{Camera, Distortion};
@@ -378,25 +377,6 @@ fn charts_and_sheets_are_drawn() {
 
 // --- the command ---------------------------------------------------------------------------------------
 
-const JOINTS: [&str; 6] = [
-    "shoulder_pan",
-    "shoulder_lift",
-    "elbow",
-    "wrist_1",
-    "wrist_2",
-    "wrist_3",
-];
-
-/// Where the known model says that the joints are, whatever the image.
-const XYZ: [[f64; 3]; 6] = [
-    [-0.25, 0.25, 2.0],
-    [-0.2, 0.1, 2.0],
-    [0.0, -0.2, 1.9],
-    [0.1, -0.1, 1.8],
-    [0.2, 0.0, 1.7],
-    [0.25, 0.05, 1.6],
-];
-
 struct Bench {
     folder: TempDir,
 }
@@ -419,11 +399,7 @@ impl Bench {
 
     /// stdout, stderr and the exit code.
     fn evaluate(&self, arguments: &[&str]) -> (String, String, i32) {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_whereabot"));
-        command.current_dir(self.folder.path());
-        for variable in ["WGPU_BACKEND", "WGPU_ADAPTER_NAME", "RUST_LOG"] {
-            command.env_remove(variable);
-        }
+        let mut command = command(self.folder.path());
         let output = command.arg("evaluate").args(arguments).output().unwrap();
         let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
         let code = output.status.code().unwrap();
@@ -507,47 +483,12 @@ struct Known {
     nearer: f64,
 }
 
-/// 16 x 12 pixels with a right angle of view. The mask is what is red at least by half; the joints are
-/// [`XYZ`] plus `gain` times what is behind the mask.
+/// With the curves of a short training.
 fn known_model(robot: &str, gain: f32) -> Vec<u8> {
-    let description = json!({
-        "version": 1, "family": "paper", "robot": robot, "joints": JOINTS,
-        "input": {"width": 16, "height": 12},
-        "camera": {"fx": 8.0, "fy": 8.0, "cx": 7.5, "cy": 5.5},
-        "mask_network": {"layers": [
-            {"name": "conv1", "op": "conv2d", "inputs": ["image"], "out_channels": 1, "kernel": 1,
-             "dilation": 1, "activation": "sigmoid"}]},
-        "overlay": {"rule": "multiply"},
-        "joint_network": {"layers": [
-            {"name": "pool1", "op": "max_pool2d", "inputs": ["overlay"], "size": 4},
-            {"name": "dense", "op": "dense", "inputs": ["pool1"], "out_features": 18,
-             "activation": "none"}]},
-        "presence": {"mask_threshold": 0.5, "sure_threshold": 0.7, "min_sure": 0.01},
-        "card": {"curves": {
-            "mask_accuracy": [[100, 0.8], [200, 0.95], [300, 0.97]],
-            "true_mask_cm": [[100, 20.0], [200, 5.0]]}},
-    });
-    let bytes =
-        |values: &[f32]| -> Vec<u8> { values.iter().flat_map(|v| v.to_le_bytes()).collect() };
-    let bias: Vec<f32> = XYZ.iter().flatten().map(|&v| v as f32).collect();
-    let tensors = [
-        (
-            "mask.conv1.weight",
-            vec![1, 3, 1, 1],
-            bytes(&[20.0, 0.0, 0.0]),
-        ),
-        ("mask.conv1.bias", vec![1], bytes(&[-10.0])),
-        ("joint.dense.weight", vec![18, 36], bytes(&[gain; 18 * 36])),
-        ("joint.dense.bias", vec![18], bytes(&bias)),
-    ];
-    let views = tensors.iter().map(|(name, shape, data)| {
-        (
-            *name,
-            TensorView::new(Dtype::F32, shape.clone(), data).unwrap(),
-        )
-    });
-    let metadata = HashMap::from([("whereabot".to_owned(), description.to_string())]);
-    safetensors::serialize(views, Some(metadata)).unwrap()
+    let card = json!({"curves": {
+        "mask_accuracy": [[100, 0.8], [200, 0.95], [300, 0.97]],
+        "true_mask_cm": [[100, 20.0], [200, 5.0]]}});
+    known::model(robot, XYZ, gain, &card)
 }
 
 fn left_half(x: u32) -> bool {

@@ -5,10 +5,10 @@ mod common;
 
 use std::path::{Path, PathBuf};
 
-use common::{device, difference};
+use common::{device, difference, joints};
 use image::RgbaImage;
 use whereabot::camera::Camera;
-use whereabot::cascade::{Estimate, Locator, Output, Status};
+use whereabot::cascade::{Locator, Output, Status};
 use whereabot::draw;
 use whereabot::network::Model;
 
@@ -42,14 +42,6 @@ const WITH_MASK: Output = Output {
     mask: true,
     mask_only: false,
 };
-
-fn joints(estimate: &Estimate) -> Vec<f32> {
-    estimate
-        .joints
-        .iter()
-        .flat_map(|j| j.xyz_m.map(|v| v as f32))
-        .collect()
-}
 
 #[test]
 fn every_file_in_weights_loads() {

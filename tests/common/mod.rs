@@ -9,9 +9,19 @@
 
 use std::sync::{Arc, OnceLock};
 
+use whereabot::cascade::Estimate;
 use whereabot::gpu::{AdapterRequest, Device, NetworkPlan, Tensor};
 use whereabot::network::{Layer, Network, Operation, Parameters, Shape};
 use whereabot::reference;
+
+/// The joints of an estimate, one number after the other.
+pub fn joints(estimate: &Estimate) -> Vec<f32> {
+    estimate
+        .joints
+        .iter()
+        .flat_map(|j| j.xyz_m.map(|v| v as f32))
+        .collect()
+}
 
 /// How often a property is tried. Failures print their case; they are kept as tests by hand.
 pub fn cases(count: u32) -> proptest::test_runner::Config {

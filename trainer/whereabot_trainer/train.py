@@ -374,9 +374,10 @@ def train_joint(args):
     else:
         unit, layers = Standardised.of(samples.joints[numbers]), paper_joint_layers(args.dilations, args.pool)
     card |= {"family": args.family, "samples": len(numbers), "overlay": rule, "min_coverage": args.min_coverage,
-             "heat_weight": args.heat_weight, "estimated_masks": args.estimated_masks, "estimated_after": args.estimated_after, **unit.card()}
+             "estimated_masks": args.estimated_masks, "estimated_after": args.estimated_after, **unit.card()}
     network = initialise(Network(layers, JOINT_INPUT, normalise=args.normalise))
     if args.family == "context":
+        card |= {"heat_weight": args.heat_weight}
         _prepare_heatmaps(network, samples.joints[numbers] / samples.arms[numbers, None, None])
     if args.init_from:
         tensors, origin = starting_tensors(args.init_from, "joint")
