@@ -57,10 +57,8 @@ fn consistent(report: &Value) -> Result<(), String> {
             if ms > 0.0 {
                 let operations = number(layer, "gflop_per_s")? * ms / 1e3;
                 let bytes = number(layer, "gb_per_s")? * ms;
-                // A layer of a nanosecond has a rate, but not an exact one.
-                let exact = |a, b| ms < 1e-3 || equal(a, b);
-                ensure("GFLOP/s", exact(operations, number(layer, "gflop")?))?;
-                ensure("GB/s", exact(bytes, number(layer, "mb")?))?;
+                ensure("GFLOP/s", equal(operations, number(layer, "gflop")?))?;
+                ensure("GB/s", equal(bytes, number(layer, "mb")?))?;
             }
         }
         ensure("sum of GFLOP", equal(gflop, number(entry, "gflop")?))?;

@@ -290,7 +290,11 @@ pub struct Start {
     pub note: String,
 }
 
-/// To six digits behind the point: a nanosecond, a byte.
+/// To six digits: more than a clock is good for.
 pub(super) fn rounded(value: f64) -> f64 {
-    (value * 1e6).round() / 1e6
+    if value == 0.0 || !value.is_finite() {
+        return value;
+    }
+    let scale = 10_f64.powi(5 - value.abs().log10().floor() as i32);
+    (value * scale).round() / scale
 }
