@@ -1,7 +1,7 @@
 use std::fmt::Write as _;
 
 use super::report::{CascadeFigures, LayerFigures, Report};
-use super::table::{Table, ms, number};
+use super::table::{Table, number};
 
 /// What `new` takes of the time of `old`, layer by layer and batch by batch, for people. `names` say
 /// where the two come from.
@@ -33,27 +33,26 @@ pub fn compare((old_name, new_name): (&str, &str), old: &Report, new: &Report) -
         return text;
     }
 
-    text += "\nCascade, median ms\n";
-    let mut table = Table::new(
-        2,
-        &[
-            "batch",
-            "precision",
-            "wall old",
-            "new",
-            "ratio",
-            "GPU old",
-            "new",
-            "ratio",
-            "images/s old",
-            "new",
-        ],
-    );
+    text += "\nCascade, ms: medians, and the ratio of the shortest\n";
+    let header = [
+        "batch",
+        "precision",
+        "wall old",
+        "new",
+        "ratio",
+        "of best",
+        "GPU old",
+        "new",
+        "ratio",
+        "of best",
+    ];
+    let mut table = Table::new(2, &header);
     for (o, n) in &cascade {
         let mut cells = vec![o.batch.to_string(), o.precision.to_string()];
-        cells.extend(triple(Some(o.wall_ms_p50), Some(n.wall_ms_p50)));
-        cells.extend(triple(o.gpu_ms_p50, n.gpu_ms_p50));
-        cells.extend([o, n].map(|c| number(Some(c.frames_per_s), 2)));
+        cells.extend(ratios(Some(o.wall_ms_p50), Some(n.wall_ms_p50), 3));
+        cells.push(ratio(Some(o.wall_ms_min), Some(n.wall_ms_min)));
+        cells.extend(ratios(o.gpu_ms_p50, n.gpu_ms_p50, 3));
+        cells.push(ratio(o.gpu_ms_min, n.gpu_ms_min));
         table.row(cells);
     }
     text += &table.to_string();
@@ -65,7 +64,7 @@ pub fn compare((old_name, new_name): (&str, &str), old: &Report, new: &Report) -
         };
         let _ = writeln!(
             text,
-            "\nLayers, batch {}, {}, median ms",
+            "\nLayers, batch {}, {}, ms: medians, and the ratio of the shortest",
             o.batch, o.precision
         );
         text += &layers(&of(old), &of(new)).to_string();
@@ -80,7 +79,7 @@ pub fn compare((old_name, new_name): (&str, &str), old: &Report, new: &Report) -
         ];
         for (name, o, n) in rows {
             let mut cells = vec![name.to_owned()];
-            cells.extend(triple(o, n));
+            cells.extend(ratios(o, n, 0));
             table.row(cells);
         }
         text += &table.to_string();
@@ -115,12 +114,15 @@ fn differences(old: &Report, new: &Report) -> Vec<String> {
 }
 
 fn layers(old: &[LayerFigures], new: &[LayerFigures]) -> Table {
-    let mut table = Table::new(2, &["layer", "kernel", "old", "new", "ratio"]);
-    let mut row = |name: &str, kernel: String, o: Option<f64>, n: Option<f64>| {
+    let mut table = Table::new(2, &["layer", "kernel", "old", "new", "ratio", "of best"]);
+    let mut row = |name: &str, kernel: String, old: Option<[f64; 2]>, new: Option<[f64; 2]>| {
+        let [p50, min] = [0, 1].map(|index| (old.map(|ms| ms[index]), new.map(|ms| ms[index])));
         let mut cells = vec![name.to_owned(), kernel];
-        cells.extend(triple(o, n));
+        cells.extend(ratios(p50.0, p50.1, 3));
+        cells.push(ratio(min.0, min.1));
         table.row(cells);
     };
+    let times = |layer: &LayerFigures| [layer.ms_p50, layer.ms_min];
     for o in old {
         let n = new.iter().find(|n| n.layer == o.layer);
         let kernel = match n {
@@ -128,24 +130,34 @@ fn layers(old: &[LayerFigures], new: &[LayerFigures]) -> Table {
             Some(_) => o.kernel.clone(),
             None => format!("{} (old only)", o.kernel),
         };
-        row(&o.layer, kernel, Some(o.ms_p50), n.map(|n| n.ms_p50));
+        row(&o.layer, kernel, Some(times(o)), n.map(times));
     }
     for n in new {
         if !old.iter().any(|o| o.layer == n.layer) {
             let kernel = format!("{} (new only)", n.kernel);
-            row(&n.layer, kernel, None, Some(n.ms_p50));
+            row(&n.layer, kernel, None, Some(times(n)));
         }
     }
-    let sum = |layers: &[LayerFigures]| Some(layers.iter().map(|layer| layer.ms_p50).sum());
+    let sum = |layers: &[LayerFigures]| {
+        let zero = [0.0; 2];
+        let add = |[p50, min]: [f64; 2], layer| {
+            let [a, b] = times(layer);
+            [p50 + a, min + b]
+        };
+        Some(layers.iter().fold(zero, add))
+    };
     row("all", String::new(), sum(old), sum(new));
     table
 }
 
-/// Old, new, and new by old.
-fn triple(old: Option<f64>, new: Option<f64>) -> [String; 3] {
-    let ratio = match (old, new) {
+/// Old and new milliseconds, and new by old.
+fn ratios(old: Option<f64>, new: Option<f64>, digits: usize) -> [String; 3] {
+    [number(old, digits), number(new, digits), ratio(old, new)]
+}
+
+fn ratio(old: Option<f64>, new: Option<f64>) -> String {
+    match (old, new) {
         (Some(old), Some(new)) if old > 0.0 => format!("{:.2}", new / old),
         _ => "-".to_owned(),
-    };
-    [ms(old), ms(new), ratio]
+    }
 }

@@ -80,7 +80,8 @@ fn batch_figures(
         }
         runs += 1;
     }
-    let [p50, p95, p99] = [0.5, 0.95, 0.99].map(|share| wall.percentile(share).unwrap_or_default());
+    let [p50, min, p95, p99] =
+        [0.5, 0.0, 0.95, 0.99].map(|share| wall.percentile(share).unwrap_or_default());
     let operations: u64 = works.iter().map(|layer| layer.work.operations).sum();
     let figures = CascadeFigures {
         batch,
@@ -88,7 +89,9 @@ fn batch_figures(
         runs,
         gflop: operations as f64 / 1e9,
         gpu_ms_p50: None,
+        gpu_ms_min: None,
         wall_ms_p50: rounded(p50),
+        wall_ms_min: rounded(min),
         wall_ms_p95: rounded(p95),
         wall_ms_p99: rounded(p99),
         upload_ms_p50: None,
@@ -103,10 +106,7 @@ fn batch_figures(
     let layers = works
         .into_iter()
         .zip(&layers)
-        .map(|(layer, sample)| {
-            let ms = sample.median().unwrap_or_default();
-            layer.figures(batch, Precision::F32, ms, None)
-        })
+        .map(|(layer, sample)| layer.figures(batch, Precision::F32, sample, None))
         .collect();
     Ok((figures, layers))
 }

@@ -137,8 +137,8 @@ impl Batch {
             runs += 1;
         }
         let [wall, upload, compute, readback, cpu_us, gpu] =
-            samples.map(|sample| [0.5, 0.95, 0.99].map(|share| sample.percentile(share)));
-        let [p50, p95, p99] = wall.map(Option::unwrap_or_default);
+            samples.map(|sample| [0.5, 0.0, 0.95, 0.99].map(|share| sample.percentile(share)));
+        let [p50, min, p95, p99] = wall.map(Option::unwrap_or_default);
         let operations: u64 = self.plan.steps(true).map(|s| s.work().operations).sum();
         let memory = allocated(device).zip(self.allocated_before);
         Ok(CascadeFigures {
@@ -147,7 +147,9 @@ impl Batch {
             runs,
             gflop: operations as f64 / 1e9,
             gpu_ms_p50: gpu[0].map(rounded),
+            gpu_ms_min: gpu[1].map(rounded),
             wall_ms_p50: rounded(p50),
+            wall_ms_min: rounded(min),
             wall_ms_p95: rounded(p95),
             wall_ms_p99: rounded(p99),
             upload_ms_p50: upload[0].map(rounded),
@@ -223,10 +225,10 @@ impl Batch {
             }
             runs += 1;
         }
-        let figures = passes.iter().zip(&samples).map(|(steps, sample)| {
-            let ms = sample.median().unwrap_or_default();
-            layer(steps).figures(self.batch, precision, ms, roofline)
-        });
+        let figures = passes
+            .iter()
+            .zip(&samples)
+            .map(|(steps, sample)| layer(steps).figures(self.batch, precision, sample, roofline));
         Ok(figures.collect())
     }
 }

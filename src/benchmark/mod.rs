@@ -24,6 +24,7 @@ pub use report::{
 pub use roofline::Roofline;
 
 use report::rounded;
+use statistics::Sample;
 
 /// What to measure.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -171,9 +172,10 @@ impl LayerWork {
         self,
         batch: usize,
         precision: Precision,
-        ms: f64,
+        times: &Sample,
         roofline: Option<&Roofline>,
     ) -> LayerFigures {
+        let ms = times.median().unwrap_or_default();
         let per_second = |amount: u64| (ms > 0.0).then(|| rounded(amount as f64 / ms / 1e6));
         LayerFigures {
             batch,
@@ -181,6 +183,7 @@ impl LayerWork {
             gflop: self.work.operations as f64 / 1e9,
             mb: self.work.bytes as f64 / 1e6,
             ms_p50: rounded(ms),
+            ms_min: rounded(times.least().unwrap_or_default()),
             gflop_per_s: per_second(self.work.operations),
             gb_per_s: per_second(self.work.bytes),
             roofline_share: roofline

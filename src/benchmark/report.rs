@@ -233,6 +233,8 @@ pub struct LayerFigures {
     pub mb: f64,
     /// Median of its time, in milliseconds.
     pub ms_p50: f64,
+    /// The shortest: on a machine that has other work too, this compares best.
+    pub ms_min: f64,
     /// Billions of operations a second.
     pub gflop_per_s: Option<f64>,
     /// Billions of bytes a second.
@@ -254,9 +256,13 @@ pub struct CascadeFigures {
     pub gflop: f64,
     /// Median of the GPU's time for all layers, in milliseconds; `None` without timestamps.
     pub gpu_ms_p50: Option<f64>,
+    /// The shortest of the same.
+    pub gpu_ms_min: Option<f64>,
     /// From the images in memory to the answer in memory, in milliseconds.
     pub wall_ms_p50: f64,
-    /// The 95th percentile of the same.
+    /// The shortest of the same.
+    pub wall_ms_min: f64,
+    /// The 95th percentile.
     pub wall_ms_p95: f64,
     /// The 99th percentile.
     pub wall_ms_p99: f64,

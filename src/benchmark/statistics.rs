@@ -15,6 +15,10 @@ impl Sample {
         sorted.get(rank.max(1) - 1).copied()
     }
 
+    pub fn least(&self) -> Option<f64> {
+        self.percentile(0.0)
+    }
+
     pub fn median(&self) -> Option<f64> {
         self.percentile(0.5)
     }

@@ -53,7 +53,7 @@ pub(super) fn number(value: Option<f64>, digits: usize) -> String {
 }
 
 /// Milliseconds: a microsecond shows.
-pub(super) fn ms(value: Option<f64>) -> String {
+fn ms(value: Option<f64>) -> String {
     number(value, 3)
 }
 
@@ -104,7 +104,7 @@ impl Report {
             shown.batch, shown.precision, self.timing
         )?;
         let mut header = vec![
-            "layer", "kernel", "GFLOP", "MB", "ms", "of time", "GFLOP/s", "GB/s",
+            "layer", "kernel", "GFLOP", "MB", "ms", "best", "of time", "GFLOP/s", "GB/s",
         ];
         if self.roofline.is_some() {
             header.push("of reach");
@@ -126,6 +126,7 @@ impl Report {
                 number(some(layer.gflop), 3),
                 number(Some(layer.mb), 2),
                 ms(Some(layer.ms_p50)),
+                ms(Some(layer.ms_min)),
                 percent(some(total).map(|total| layer.ms_p50 / total)),
                 number(layer.gflop_per_s.and_then(some), 1),
                 number(layer.gb_per_s, 2),
@@ -151,6 +152,7 @@ impl Report {
             number(Some(gflop), 3),
             number(Some(mb), 2),
             ms(Some(total)),
+            ms(Some(of(shown.batch).map(|layer| layer.ms_min).sum())),
             percent(some(total).map(|_| 1.0)),
             number(some(total).map(|total| gflop / total * 1e3), 1),
             number(some(total).map(|total| mb / total), 2),
@@ -186,7 +188,7 @@ impl Report {
         if on_gpu {
             header.push("GPU ms");
         }
-        header.extend(["wall ms", "p95", "p99"]);
+        header.extend(["wall ms", "best", "p95", "p99"]);
         if on_gpu {
             header.extend([
                 "upload", "compute", "readback", "CPU us", "GPU MB", "plan ms",
@@ -203,7 +205,9 @@ impl Report {
             if on_gpu {
                 cells.push(ms(c.gpu_ms_p50));
             }
-            cells.extend([c.wall_ms_p50, c.wall_ms_p95, c.wall_ms_p99].map(|v| ms(Some(v))));
+            cells.extend(
+                [c.wall_ms_p50, c.wall_ms_min, c.wall_ms_p95, c.wall_ms_p99].map(|v| ms(Some(v))),
+            );
             if on_gpu {
                 cells.extend([c.upload_ms_p50, c.compute_ms_p50, c.readback_ms_p50].map(ms));
                 cells.push(number(c.cpu_us_p50, 0));
