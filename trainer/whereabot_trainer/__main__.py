@@ -23,6 +23,9 @@ def _training_flags(parser, *, minutes, batch, learning_rate, momentum, dilation
                         help="train for so long, resumed parts included; rates follow the clock (%(default)s)")
     length.add_argument("--iterations", type=int, metavar="N", help="train for N batches instead: reproducible")
     parser.add_argument("--batch", type=int, default=batch, metavar="N", help="samples a batch (%(default)s)")
+    parser.add_argument("--camera", choices=("free", "fixed"), default="free",
+                        help="free: show other views too (mask: zoomed, tilted, mirrored; joints: a turned camera, parts"
+                        " hidden); fixed: the recordings' camera stays where it is (%(default)s)")
     parser.add_argument("--dilations", type=_integers, default=dilations, metavar="D,D,...",
                         help="dilation of each convolution (%(default)s)")
     parser.add_argument("--optimizer", choices=("adamw", "sgd"), default="adamw", help="(%(default)s)")

@@ -230,7 +230,7 @@ def train_mask(args):
     w_fg, w_bg = losses.class_weights(share)
     height, width = args.crop[1], args.crop[0]
     card |= {"family": args.family, "foreground_share": share, "w_fg": w_fg, "w_bg": w_bg,
-             "crop": args.crop, "zoom": args.zoom}
+             "crop": args.crop, "camera": args.camera, **({"zoom": args.zoom} if args.camera == "free" else {})}
     layers = context_mask_layers() if args.family == "context" else paper_mask_layers(args.dilations)
     network = initialise(Network(layers, MASK_INPUT, normalise=args.normalise))
     if args.init_from:
@@ -249,6 +249,8 @@ def train_mask(args):
             drawn = torch.randint(len(negatives), (int(rows.sum()),), device="cpu")
             images[rows], masks[rows] = torch.from_numpy(negatives[drawn.numpy()]), 0.0
         images, masks = data.jitter_colours(images.to(args.device)), masks.to(args.device)
+        if args.camera == "fixed":
+            return data.random_crops(images, masks, height, width)
         return data.random_views(images, masks, height, width, zoom=args.zoom)
 
     def batch_loss(images, masks):
@@ -373,7 +375,7 @@ def train_joint(args):
         unit, layers = ArmLengths(), heatmap_joint_layers()
     else:
         unit, layers = Standardised.of(samples.joints[numbers]), paper_joint_layers(args.dilations, args.pool)
-    card |= {"family": args.family, "samples": len(numbers), "overlay": rule, "min_coverage": args.min_coverage,
+    card |= {"family": args.family, "samples": len(numbers), "camera": args.camera, "overlay": rule, "min_coverage": args.min_coverage,
              "estimated_masks": args.estimated_masks, "estimated_after": args.estimated_after, **unit.card()}
     network = initialise(Network(layers, JOINT_INPUT, normalise=args.normalise))
     if args.family == "context":
@@ -404,9 +406,10 @@ def train_joint(args):
             for row in torch.nonzero(torch.rand(len(batch), device="cpu") < args.estimated_masks).flatten():
                 masks[row, 0] = torch.from_numpy(estimated[int(batch[row])]).float() / 255
         images, masks = data.jitter_colours(images.to(args.device)), masks.to(args.device)
-        overlays = data.erase_rectangles(overlay(images, masks, rule))
-        overlays, truth = data.rotate_camera(
-            overlays, joints[batch].to(args.device), data.random_rotations(len(batch)))
+        overlays, truth = overlay(images, masks, rule), joints[batch].to(args.device)
+        if args.camera == "free":
+            overlays, truth = data.rotate_camera(
+                data.erase_rectangles(overlays), truth, data.random_rotations(len(batch)))
         return overlays, (truth, arms[batch].to(args.device))
 
     def batch_loss(overlays, joints_and_arms):
