@@ -266,11 +266,12 @@ pub struct CascadeFigures {
     pub wall_ms_p95: f64,
     /// The 99th percentile.
     pub wall_ms_p99: f64,
-    /// Medians of the wall time's parts. Handing the images to the driver;
+    /// Median of the wall time's first part, in milliseconds: handing the images to the driver.
     pub upload_ms_p50: Option<f64>,
-    /// encoding, submitting, and waiting for the GPU, the images' way to it included;
+    /// Of its second part: encoding, submitting, and waiting for the GPU, the images' way to it
+    /// included.
     pub compute_ms_p50: Option<f64>,
-    /// fetching the answer from the GPU that is done.
+    /// Of its third part: fetching the answer from a GPU that is done.
     pub readback_ms_p50: Option<f64>,
     /// Median of what the CPU does besides handing the images over and waiting (encode, submit,
     /// readback), in microseconds.

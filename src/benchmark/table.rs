@@ -75,9 +75,9 @@ impl fmt::Display for Report {
             )?;
         }
         for first in first_of_each_precision(&self.cascade) {
-            self.layers(f, first)?;
+            self.write_layers(f, first)?;
         }
-        self.cascade(f)?;
+        self.write_cascade(f)?;
         if let Some(start) = &self.start {
             write!(f, "\n{start}")?;
         }
@@ -87,7 +87,7 @@ impl fmt::Display for Report {
 
 impl Report {
     /// The layers of the batch of `shown` in full, and what an image takes at other batch sizes.
-    fn layers(&self, f: &mut fmt::Formatter<'_>, shown: &CascadeFigures) -> fmt::Result {
+    fn write_layers(&self, f: &mut fmt::Formatter<'_>, shown: &CascadeFigures) -> fmt::Result {
         let of = |batch: usize| {
             let same = move |l: &&LayerFigures| l.batch == batch && l.precision == shown.precision;
             self.layers.iter().filter(same)
@@ -177,7 +177,7 @@ impl Report {
         Ok(())
     }
 
-    fn cascade(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+    fn write_cascade(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let [width, height] = self.image;
         writeln!(
             f,
