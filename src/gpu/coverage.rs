@@ -1,6 +1,6 @@
 use bytemuck::{Pod, Zeroable};
 
-use super::step::{Step, StepDescriptor};
+use super::step::{Step, StepDescriptor, Tensors};
 use super::tensor::Tensor;
 use super::{Device, GpuError};
 use crate::network::Coverage;
@@ -48,25 +48,20 @@ pub fn coverage(
     totals: &wgpu::Buffer,
     (threshold, sure_threshold): (f32, f32),
 ) -> Result<Step, GpuError> {
-    let (height, width) = (mask.shape.height, mask.shape.width);
     Step::new(
         device,
         &StepDescriptor {
             label: "coverage",
             source: include_str!("../../shaders/coverage.wgsl"),
             entry_point: "main",
+            tensors: Tensors::from(mask),
             constants: &[
-                ("WIDTH", width as f64),
-                ("HEIGHT", height as f64),
-                ("BATCH", mask.batch as f64),
                 ("THRESHOLD", f64::from(threshold)),
                 ("SURE_THRESHOLD", f64::from(sure_threshold)),
             ],
-            bindings: &[
-                (0, mask.buffer.as_entire_binding()),
-                (1, totals.as_entire_binding()),
-            ],
-            workgroups: mask.batch * (height * width).div_ceil(256),
+            sizes: &[],
+            bindings: &[(3, totals.as_entire_binding())],
+            workgroups: mask.batch * (mask.shape.height * mask.shape.width).div_ceil(256),
         },
     )
 }

@@ -2,12 +2,14 @@
 
 mod adapter;
 mod back_project;
+mod choice;
 mod concat;
 mod conv2d;
 mod coverage;
 mod dense;
 mod device;
 mod error;
+mod layout;
 mod max_pool2d;
 mod network;
 mod overlay;
@@ -17,17 +19,21 @@ mod sigmoid;
 mod soft_argmax2d;
 mod step;
 mod tensor;
+mod text;
 mod tier;
 mod upsample2d;
 
 pub use adapter::{AdapterReport, AdapterRequest, Choice, Wanted, list_adapters};
+pub use choice::Conv2dKernel;
 pub use coverage::{Totals, coverage};
 pub use device::Device;
 pub use error::GpuError;
+pub use layout::Layout;
 pub use network::NetworkPlan;
 pub use overlay::overlay;
 pub use plan::{Frame, Plan};
 pub use rectify::Rectify;
 pub use step::Step;
 pub use tensor::Tensor;
+pub use text::kernel_text;
 pub use tier::Tier;

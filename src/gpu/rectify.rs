@@ -1,6 +1,6 @@
 use image::RgbaImage;
 
-use super::step::{Step, StepDescriptor};
+use super::step::{Step, StepDescriptor, Tensors};
 use super::tensor::Tensor;
 use super::{Device, GpuError};
 use crate::camera::Rectification;
@@ -35,8 +35,10 @@ impl Rectify {
                 label: "rectify",
                 source: include_str!("../../shaders/rectify.wgsl"),
                 entry_point: "main",
-                constants: &[("WIDTH", width as f64), ("HEIGHT", height as f64)],
-                bindings: &bindings(&view, &params, output),
+                tensors: Tensors::to(output),
+                constants: &[],
+                sizes: &[],
+                bindings: &bindings(&view, &params),
                 workgroups: (height * width).div_ceil(64),
             },
         )?;
@@ -63,7 +65,7 @@ impl Rectify {
             self.texture = device.scoped(|| texture(device, width, height))?;
             let view = self.texture.create_view(&Default::default());
             self.step
-                .rebind(device, &bindings(&view, &self.params, output));
+                .rebind(device, Tensors::to(output), &bindings(&view, &self.params));
         }
         device.queue().write_texture(
             self.texture.as_image_copy(),
@@ -90,12 +92,10 @@ impl Rectify {
 fn bindings<'a>(
     view: &'a wgpu::TextureView,
     params: &'a wgpu::Buffer,
-    output: &'a Tensor,
-) -> [(u32, wgpu::BindingResource<'a>); 3] {
+) -> [(u32, wgpu::BindingResource<'a>); 2] {
     [
-        (0, wgpu::BindingResource::TextureView(view)),
-        (1, params.as_entire_binding()),
-        (2, output.buffer.as_entire_binding()),
+        (3, wgpu::BindingResource::TextureView(view)),
+        (4, params.as_entire_binding()),
     ]
 }
 
