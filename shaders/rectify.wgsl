@@ -25,7 +25,7 @@ struct Rectification {
     index: u32,
 }
 
-@group(0) @binding(3) var source: texture_2d<f32>;
+@group(0) @binding(3) var source: texture_storage_2d<rgba8unorm, read>;
 @group(0) @binding(4) var<uniform> params: Rectification;
 
 // Where a ray at z = 1 lands in the source, in pixels.
@@ -60,7 +60,7 @@ fn ray_of(pixel: vec2<f32>) -> vec2<f32> {
 
 fn load(at: vec2<i32>) -> vec3<f32> {
     let inside = all(at >= vec2(0)) && all(at < vec2<i32>(params.size));
-    return select(vec3(0.0), textureLoad(source, clamp(at, vec2(0), vec2<i32>(params.size) - 1), 0).rgb, inside);
+    return select(vec3(0.0), textureLoad(source, clamp(at, vec2(0), vec2<i32>(params.size) - 1)).rgb, inside);
 }
 
 // Bilinear, as if black pixels lay round the source: without a step at its border.

@@ -126,7 +126,7 @@ fn every_layer_of_the_gpu_agrees_with_pytorch() {
             (&model.joint_network, "joint", "overlay"),
         ];
         for (network, prefix, source) in networks {
-            let input = NetworkPlan::input(&device, device.layout(), "input", &network, 1).unwrap();
+            let input = NetworkPlan::input(&device, device.layout(), "input", network, 1).unwrap();
             input
                 .write(&device, &golden(name, &format!("{prefix}.{source}")))
                 .unwrap();
