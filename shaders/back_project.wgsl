@@ -1,14 +1,11 @@
-// From slopes and the logarithm of depth (x / z, y / z, ln z) to the point (x, y, z), joint by joint.
-// Activations of one pixel are [image][channel / 4] of vec4, seen here as scalars: a joint may lie
-// in two vec4.
+// From slopes and the logarithm of depth (x / z, y / z, ln z) to the point (x, y, z), joint by joint:
+// a vec4 of the output an invocation. A joint may lie in two vec4.
 
 override JOINTS: u32;
-override BATCH: u32;
 
-override STRIDE: u32 = (3u * JOINTS + 3u) / 4u * 4u;
-
-@group(0) @binding(0) var<storage, read> input: array<f32>;
-@group(0) @binding(1) var<storage, read_write> output: array<f32>;
+fn value(image: u32, channel: u32) -> f32 {
+    return input_at(channel / 4u * BATCH + image, 0u, 0u)[channel % 4u];
+}
 
 @compute @workgroup_size(64)
 fn main(
@@ -17,12 +14,17 @@ fn main(
     @builtin(local_invocation_index) local: u32,
 ) {
     let index = (group.y * groups.x + group.x) * 64u + local;
-    if index >= BATCH * JOINTS {
+    if index >= OUTPUT_PLANES {
         return;
     }
-    let first = index / JOINTS * STRIDE + index % JOINTS * 3u;
-    let z = exp(input[first + 2u]);
-    output[first] = input[first] * z;
-    output[first + 1u] = input[first + 1u] * z;
-    output[first + 2u] = z;
+    let image = index % BATCH;
+    var texel = vec4(0.0);
+    for (var lane = 0u; lane < 4u; lane++) {
+        let channel = index / BATCH * 4u + lane;
+        if channel < 3u * JOINTS {
+            let z = exp(value(image, channel / 3u * 3u + 2u));
+            texel[lane] = select(value(image, channel) * z, z, channel % 3u == 2u);
+        }
+    }
+    output_set(index, 0u, 0u, texel);
 }

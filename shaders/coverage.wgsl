@@ -1,19 +1,17 @@
 // Counts and bounds the pixels of each mask that reach THRESHOLD, and counts those that reach
 // SURE_THRESHOLD and those that are not finite. A workgroup reduces its 256 pixels, then adds them to its image's totals.
 
-override WIDTH: u32;
-override HEIGHT: u32;
-override BATCH: u32;
 override THRESHOLD: f32;
 override SURE_THRESHOLD: f32;
 
-override GROUPS: u32 = (WIDTH * HEIGHT + 255u) / 256u;
+override PIXELS: u32 = INPUT_WIDTH * INPUT_HEIGHT;
+override GROUPS: u32 = (PIXELS + 255u) / 256u;
 
 struct Totals {
     pixels: atomic<u32>,
     sure: atomic<u32>,
     not_finite: atomic<u32>,
-    // The greatest of WIDTH - x, HEIGHT - y, x + 1 and y + 1: zero, to which the buffer is cleared,
+    // The greatest of width - x, height - y, x + 1 and y + 1: zero, to which the buffer is cleared,
     // stands for no pixel.
     from_right: atomic<u32>,
     from_bottom: atomic<u32>,
@@ -21,9 +19,8 @@ struct Totals {
     from_top: atomic<u32>,
 }
 
-@group(0) @binding(0) var<storage, read> mask: array<vec4<f32>>;
 // [image], cleared before
-@group(0) @binding(1) var<storage, read_write> totals: array<Totals>;
+@group(0) @binding(3) var<storage, read_write> totals: array<Totals>;
 
 var<workgroup> pixels: atomic<u32>;
 var<workgroup> sure: atomic<u32>;
@@ -42,8 +39,10 @@ fn main(
     let group_index = group.y * groups.x + group.x;
     let image = group_index / GROUPS;
     let pixel = group_index % GROUPS * 256u + local;
-    if image < BATCH && pixel < WIDTH * HEIGHT {
-        let probability = mask[image * WIDTH * HEIGHT + pixel].x;
+    if image < BATCH && pixel < PIXELS {
+        let x = pixel % INPUT_WIDTH;
+        let y = pixel / INPUT_WIDTH;
+        let probability = input_at(image, y, x).x;
         // By its bits: a compiler may assume that a float is a number.
         let finite = (bitcast<u32>(probability) & 0x7f800000u) != 0x7f800000u;
         if finite && probability >= SURE_THRESHOLD {
@@ -52,11 +51,9 @@ fn main(
         if !finite {
             atomicAdd(&not_finite, 1u);
         } else if probability >= THRESHOLD {
-            let x = pixel % WIDTH;
-            let y = pixel / WIDTH;
             atomicAdd(&pixels, 1u);
-            atomicMax(&from_right, WIDTH - x);
-            atomicMax(&from_bottom, HEIGHT - y);
+            atomicMax(&from_right, INPUT_WIDTH - x);
+            atomicMax(&from_bottom, INPUT_HEIGHT - y);
             atomicMax(&from_left, x + 1u);
             atomicMax(&from_top, y + 1u);
         }

@@ -2,28 +2,24 @@
 // (some hundred thousand values) and its output short.
 //
 // `partial` sums one segment of the input for one output; `finish` adds up the segments, the bias,
-// and applies the activation. The input is read as vec4 in the order in which it lies; the weights
-// are packed to match.
+// and applies the activation. The input is read as vec4, block by block; the weights are packed to
+// match.
 
-// Length of the input, in vec4.
-override LENGTH: u32;
 override OUTPUTS: u32;
-override BATCH: u32;
 override SEGMENTS: u32;
 // 0 none, 1 ReLU, 2 sigmoid
 override ACTIVATION: u32;
 
+// Length of an image's input, in vec4.
+override PIXELS: u32 = INPUT_HEIGHT * INPUT_WIDTH;
+override LENGTH: u32 = INPUT_PLANES / BATCH * PIXELS;
 override SEGMENT: u32 = (LENGTH + SEGMENTS - 1u) / SEGMENTS;
-// The output is [image][channel / 4] of vec4, seen here as its scalars.
-override STRIDE: u32 = (OUTPUTS + 3u) / 4u * 4u;
 
-@group(0) @binding(0) var<storage, read> input: array<vec4<f32>>;
 // [output][LENGTH]
-@group(0) @binding(1) var<storage, read> weights: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read> weights: array<vec4<f32>>;
 // [image][output][segment]
-@group(0) @binding(2) var<storage, read_write> partials: array<f32>;
-@group(0) @binding(3) var<storage, read> bias: array<f32>;
-@group(0) @binding(4) var<storage, read_write> output: array<f32>;
+@group(0) @binding(4) var<storage, read_write> partials: array<f32>;
+@group(0) @binding(5) var<storage, read> bias: array<f32>;
 
 const LANES = 64u;
 var<workgroup> sums: array<f32, LANES>;
@@ -43,7 +39,10 @@ fn partial(
     if image < BATCH {
         let end = min((segment + 1u) * SEGMENT, LENGTH);
         for (var i = segment * SEGMENT + lane; i < end; i += LANES) {
-            sum += weights[row * LENGTH + i] * input[image * LENGTH + i];
+            let plane = i / PIXELS * BATCH + image;
+            let pixel = i % PIXELS;
+            let value = input_at(plane, pixel / INPUT_WIDTH, pixel % INPUT_WIDTH);
+            sum += weights[row * LENGTH + i] * value;
         }
     }
     sums[lane] = sum.x + sum.y + sum.z + sum.w;
@@ -64,19 +63,26 @@ fn finish(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let index = (group.y * groups.x + group.x) * 64u + local;
-    if index >= BATCH * OUTPUTS {
+    let plane = (group.y * groups.x + group.x) * 64u + local;
+    if plane >= OUTPUT_PLANES {
         return;
     }
-    let row = index % OUTPUTS;
-    var sum = bias[row];
-    for (var segment = 0u; segment < SEGMENTS; segment++) {
-        sum += partials[index * SEGMENTS + segment];
+    let image = plane % BATCH;
+    var texel = vec4(0.0);
+    for (var lane = 0u; lane < 4u; lane++) {
+        let row = plane / BATCH * 4u + lane;
+        if row < OUTPUTS {
+            var sum = bias[row];
+            for (var segment = 0u; segment < SEGMENTS; segment++) {
+                sum += partials[(image * OUTPUTS + row) * SEGMENTS + segment];
+            }
+            texel[lane] = sum;
+        }
     }
     if ACTIVATION == 1u {
-        sum = max(sum, 0.0);
+        texel = max(texel, vec4(0.0));
     } else if ACTIVATION == 2u {
-        sum = 1.0 / (1.0 + exp(-sum));
+        texel = 1.0 / (1.0 + exp(-texel));
     }
-    output[index / OUTPUTS * STRIDE + row] = sum;
+    output_set(plane, 0u, 0u, texel);
 }

@@ -4,9 +4,6 @@
 // many as the footprint has pixels: nothing is skipped when the image shrinks. What the source does
 // not show is black. Formulas: OpenCV's camera models; see `camera::Rectification`.
 
-override WIDTH: u32;
-override HEIGHT: u32;
-
 struct Rectification {
     // 1 / fx, 1 / fy, cx, cy of the canonical camera
     canonical: vec4<f32>,
@@ -28,10 +25,8 @@ struct Rectification {
     index: u32,
 }
 
-@group(0) @binding(0) var source: texture_2d<f32>;
-@group(0) @binding(1) var<uniform> params: Rectification;
-// [image][row][column] of vec4, the last lane zero
-@group(0) @binding(2) var<storage, read_write> output: array<vec4<f32>>;
+@group(0) @binding(3) var source: texture_storage_2d<rgba8unorm, read>;
+@group(0) @binding(4) var<uniform> params: Rectification;
 
 // Where a ray at z = 1 lands in the source, in pixels.
 fn project(ray: vec2<f32>) -> vec2<f32> {
@@ -65,7 +60,7 @@ fn ray_of(pixel: vec2<f32>) -> vec2<f32> {
 
 fn load(at: vec2<i32>) -> vec3<f32> {
     let inside = all(at >= vec2(0)) && all(at < vec2<i32>(params.size));
-    return select(vec3(0.0), textureLoad(source, clamp(at, vec2(0), vec2<i32>(params.size) - 1), 0).rgb, inside);
+    return select(vec3(0.0), textureLoad(source, clamp(at, vec2(0), vec2<i32>(params.size) - 1)).rgb, inside);
 }
 
 // Bilinear, as if black pixels lay round the source: without a step at its border.
@@ -87,10 +82,11 @@ fn main(
     @builtin(local_invocation_index) local: u32,
 ) {
     let index = (group.y * groups.x + group.x) * 64u + local;
-    if index >= WIDTH * HEIGHT {
+    if index >= OUTPUT_WIDTH * OUTPUT_HEIGHT {
         return;
     }
-    let pixel = vec2(f32(index % WIDTH), f32(index / WIDTH));
+    let place = output_place(index);
+    let pixel = vec2(f32(place.x), f32(place.y));
     var colour = vec3(0.0);
     let ray = ray_of(pixel);
     if dot(ray, ray) <= params.max_radius * params.max_radius {
@@ -106,5 +102,5 @@ fn main(
         }
         colour *= step.x * step.y;
     }
-    output[params.index * WIDTH * HEIGHT + index] = vec4(colour, 0.0);
+    output_set(params.index, place.y, place.x, vec4(colour, 0.0));
 }

@@ -1,11 +1,5 @@
 // 1 / (1 + exp(-x)) of each value.
 
-// Length, in vec4.
-override LENGTH: u32;
-
-@group(0) @binding(0) var<storage, read> input: array<vec4<f32>>;
-@group(0) @binding(1) var<storage, read_write> output: array<vec4<f32>>;
-
 @compute @workgroup_size(64)
 fn main(
     @builtin(workgroup_id) group: vec3<u32>,
@@ -13,7 +7,9 @@ fn main(
     @builtin(local_invocation_index) local: u32,
 ) {
     let index = (group.y * groups.x + group.x) * 64u + local;
-    if index < LENGTH {
-        output[index] = 1.0 / (1.0 + exp(-input[index]));
+    let place = output_place(index);
+    if place.plane < OUTPUT_PLANES {
+        let value = input_at(place.plane, place.y, place.x);
+        output_set(place.plane, place.y, place.x, 1.0 / (1.0 + exp(-value)));
     }
 }

@@ -3,8 +3,12 @@
 
 mod common;
 
-use common::{check_layer, difference, noise, on_gpu, on_reference, one_layer, rounding};
+use common::{
+    check_in_buffers, check_layer, check_network_by, device, difference, noise, on_gpu, on_gpu_by,
+    on_reference, one_layer, rounding,
+};
 use proptest::prelude::*;
+use whereabot::gpu::{Conv2dKernel, Layout, NetworkPlan};
 use whereabot::network::{Activation, Operation, Shape};
 
 fn conv2d(
@@ -30,7 +34,7 @@ fn any_activation() -> impl Strategy<Value = Activation> {
 }
 
 proptest! {
-    #![proptest_config(common::cases(48))]
+    #![proptest_config(common::cases(16))]
 
     #[test]
     fn the_kernel_agrees_with_the_reference(
@@ -48,6 +52,79 @@ proptest! {
     }
 }
 
+/// The kernels that this device can run, after saying which it cannot.
+fn kernels() -> Vec<Conv2dKernel> {
+    let (here, elsewhere): (Vec<_>, Vec<_>) = Conv2dKernel::ALL
+        .into_iter()
+        .partition(|kernel| kernel.runs_on(&device()));
+    for kernel in elsewhere {
+        println!("{kernel} cannot run on {}", device().info().name);
+    }
+    here
+}
+
+/// One channel for the kernel that makes only one.
+fn channels_for(kernel: Conv2dKernel, channels: usize) -> usize {
+    if kernel == Conv2dKernel::SubgroupOne {
+        1
+    } else {
+        channels
+    }
+}
+
+proptest! {
+    #![proptest_config(common::cases(16))]
+
+    #[test]
+    fn each_kernel_agrees_with_the_reference(
+        (channels, out_channels) in (1_usize..20, 1_usize..20),
+        (height, width) in (1_usize..40, 1_usize..40),
+        batch in 1_usize..4,
+        side in prop_oneof![Just(1_usize), Just(3), Just(5)],
+        dilation in 1_usize..17,
+        activation in any_activation(),
+        seed in any::<u32>(),
+    ) {
+        // A kernel that shares rows wants a margin as wide as it reaches.
+        let dilation = dilation.min(height.max(width).div_ceil(side / 2 + 1));
+        let input = Shape::new(channels, height, width);
+        for kernel in kernels() {
+            let out_channels = channels_for(kernel, out_channels);
+            let network = one_layer(conv2d(out_channels, side, dilation, activation), input, seed.into());
+            let tolerance = rounding(channels * side * side);
+            check_network_by(kernel.layout(), Some(kernel), &network, batch, seed.into(), tolerance);
+        }
+    }
+}
+
+#[test]
+fn each_kernel_notices_a_wrong_weight() {
+    let input = Shape::new(6, 9, 11);
+    let values = noise(2 * input.len(), 2);
+    for kernel in kernels() {
+        let out_channels = channels_for(kernel, 5);
+        let network = one_layer(conv2d(out_channels, 3, 2, Activation::None), input, 1);
+        let other = common::with_one_weight_changed(&network, 1e-2);
+        let gpu = on_gpu_by(kernel.layout(), Some(kernel), &network, 2, &values);
+        assert!(difference(&gpu, &on_reference(&network, &values)).unwrap() < 1e-5);
+        assert!(difference(&gpu, &on_reference(&other, &values)).unwrap() > 1e-3);
+    }
+}
+
+#[test]
+fn a_kernel_that_does_not_serve_a_layer_says_so() {
+    let network = one_layer(conv2d(2, 3, 1, Activation::None), Shape::new(3, 4, 5), 1);
+    let device = device();
+    let input = NetworkPlan::input(&device, Layout::Buffer, "input", &network, 1).unwrap();
+    let plan = |kernel| NetworkPlan::with_kernel(&device, "net", &network, &input, Some(kernel));
+    let error = plan(Conv2dKernel::Texture).unwrap_err().to_string();
+    assert!(
+        error.contains("net.layer") && error.contains("conv2d_texture"),
+        "{error}"
+    );
+    plan(Conv2dKernel::Buffer).unwrap();
+}
+
 #[test]
 fn layers_of_the_paper_agree() {
     for (channels, out_channels, dilation) in [(3, 32, 1), (32, 32, 8), (32, 1, 1)] {
@@ -60,7 +137,8 @@ fn layers_of_the_paper_agree() {
 fn more_workgroups_than_one_dimension_holds() {
     // An invocation makes four columns of a row, a workgroup 64 times that.
     let input = Shape::new(1, 65_536 * 64 + 5, 1);
-    check_layer(conv2d(1, 1, 1, Activation::None), input, 1, 11, 1e-6);
+    let network = one_layer(conv2d(1, 1, 1, Activation::None), input, 11);
+    check_in_buffers(&network, 11, 1e-6);
 }
 
 #[test]

@@ -5,7 +5,7 @@ mod common;
 
 use common::{device, noise};
 use proptest::prelude::*;
-use whereabot::gpu::{Tensor, Totals, coverage};
+use whereabot::gpu::{Layout, Tensor, Totals, coverage};
 use whereabot::network::{Coverage, Shape};
 use whereabot::reference;
 
@@ -14,7 +14,13 @@ const SURE: f32 = 0.75;
 fn run(mask: &[f32], height: usize, width: usize, batch: usize, threshold: f32) -> Vec<Coverage> {
     let device = device();
     let shape = Shape::new(1, height, width);
-    let tensor = Tensor::new(&device, "mask", shape, batch).unwrap();
+    // More images than a texture has layers are for buffers.
+    let layout = if batch > 1000 {
+        Layout::Buffer
+    } else {
+        device.layout()
+    };
+    let tensor = Tensor::in_layout(&device, layout, "mask", shape, batch, 0).unwrap();
     tensor.write(&device, mask).unwrap();
     let size = (batch * size_of::<Totals>()) as u64;
     let buffer = |usage| {

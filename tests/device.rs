@@ -10,7 +10,9 @@ use common::{description, model_file, noise, one_layer};
 use image::RgbaImage;
 use whereabot::camera::Camera;
 use whereabot::cascade::{LocateError, Locator, Output};
-use whereabot::gpu::{AdapterRequest, Device, GpuError, NetworkPlan, Tensor, list_adapters};
+use whereabot::gpu::{
+    AdapterRequest, Device, GpuError, Layout, NetworkPlan, Tensor, list_adapters,
+};
 use whereabot::network::{Activation, Model, Operation, Shape};
 
 /// A device of its own, to be broken.
@@ -90,17 +92,21 @@ fn a_network_beyond_the_adapter_s_limits_names_the_layer() {
         dilation: 1,
         activation: Activation::None,
     };
-    let side = 4
-        * (device.wgpu().limits().max_storage_buffer_binding_size as f64 / (4096.0 * 4.0)).sqrt()
-            as usize;
-    let network = one_layer(operation, Shape::new(1, side, side / 8), 1);
-    let input = Tensor::new(&device, "input", network.input(), 1).unwrap();
-    let error = NetworkPlan::new(&device, "mask", &network, &input).unwrap_err();
-    let text = error.to_string();
-    assert!(
-        text.contains("mask.layer") && text.contains("allows"),
-        "{text}"
-    );
+    let limits = device.wgpu().limits();
+    let side = 4 * (limits.max_storage_buffer_binding_size as f64 / (4096.0 * 4.0)).sqrt() as usize;
+    for (layout, batch, side) in [
+        (Layout::Buffer, 1, side),
+        (Layout::Texture, limits.max_texture_array_layers as usize, 8),
+    ] {
+        let network = one_layer(operation, Shape::new(1, side, side / 8), 1);
+        let input = NetworkPlan::input(&device, layout, "input", &network, batch).unwrap();
+        let error = NetworkPlan::new(&device, "mask", &network, &input).unwrap_err();
+        let text = error.to_string();
+        assert!(
+            text.contains("mask.layer") && text.contains("allows"),
+            "{text}"
+        );
+    }
 }
 
 #[test]

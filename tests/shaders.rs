@@ -5,37 +5,68 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use naga::back::{PipelineConstants, glsl, hlsl, msl, pipeline_constants, spv};
-use naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
+use naga::valid::{
+    Capabilities, ModuleInfo, ShaderStages, SubgroupOperationSet, ValidationFlags, Validator,
+};
 use naga::{Module, ShaderStage};
 
-/// One for each file in `shaders/`: a kernel that nobody lists is not tested.
-const KERNELS: [&str; 14] = [
-    "back_project",
-    "concat",
-    "conv2d",
-    "coverage",
-    "dense",
-    "max_pool2d",
-    "overlay",
-    "probe_arithmetic",
-    "probe_copy",
-    "rectify",
-    "render",
-    "sigmoid",
-    "soft_argmax2d",
-    "upsample2d",
+use whereabot::gpu::{Layout, kernel_text};
+
+use Layout::Buffer;
+
+/// What the library composes from the files in `shaders/`: a file that nobody lists is not tested.
+/// Some have no layout: they bind their textures themselves, or draw.
+const KERNELS: [(&[&str], &[Layout]); 17] = [
+    (&["back_project"], &Layout::ALL),
+    (&["concat"], &Layout::ALL),
+    (&["conv2d_buffer"], &[Buffer]),
+    (&["conv2d_lattice", "conv2d_rows", "conv2d_subgroup"], &[]),
+    (&["conv2d_lattice", "conv2d_rows", "conv2d_texture"], &[]),
+    (&["conv2d_lattice", "conv2d_subgroup_one"], &[]),
+    (&["coverage"], &Layout::ALL),
+    (&["dense"], &Layout::ALL),
+    (&["max_pool2d"], &Layout::ALL),
+    (&["overlay"], &Layout::ALL),
+    (&["probe_arithmetic"], &[]),
+    (&["probe_copy"], &[]),
+    (&["rectify"], &Layout::ALL),
+    (&["render"], &[]),
+    (&["sigmoid"], &Layout::ALL),
+    (&["soft_argmax2d"], &Layout::ALL),
+    (&["upsample2d"], &Layout::ALL),
 ];
+
+/// The constants that these want in their text.
+const SIZES: [(&str, usize); 2] = [("ROWS", 3), ("KERNEL", 3)];
 
 fn source(name: &str) -> String {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("shaders");
     std::fs::read_to_string(folder.join(format!("{name}.wgsl"))).unwrap()
 }
 
+/// Every whole text of every kernel, with its name.
+fn compositions() -> Vec<(String, String)> {
+    let mut all = Vec::new();
+    for (files, layouts) in KERNELS {
+        let own: String = files.iter().map(|file| source(file)).collect();
+        for layout in layouts.iter().copied() {
+            let name = format!("{files:?}, {layout:?}");
+            all.push((name, kernel_text(Some(layout), &[], &own)));
+        }
+        if layouts.is_empty() {
+            all.push((format!("{files:?}"), kernel_text(None, &SIZES, &own)));
+        }
+    }
+    all
+}
+
 /// Valid, with a number for every constant that the plan would give.
 fn resolved(source: &str) -> Result<(Module, ModuleInfo), String> {
     let module = naga::front::wgsl::parse_str(source).map_err(|e| e.emit_to_string(source))?;
     let validate = |module: &Module| {
-        Validator::new(ValidationFlags::all(), Capabilities::empty())
+        Validator::new(ValidationFlags::all(), Capabilities::SUBGROUP)
+            .subgroup_stages(ShaderStages::COMPUTE)
+            .subgroup_operations(SubgroupOperationSet::all())
             .validate(module)
             .map_err(|e| e.emit_to_string(source))
     };
@@ -105,35 +136,45 @@ fn every_file_is_listed() {
     let found: BTreeSet<String> = std::fs::read_dir(folder)
         .unwrap()
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .filter(|name| name != "layout")
         .collect();
-    let listed: BTreeSet<String> = KERNELS.map(|name| format!("{name}.wgsl")).into();
+    let listed: BTreeSet<String> = KERNELS
+        .iter()
+        .flat_map(|(files, _)| files.iter().map(|name| format!("{name}.wgsl")))
+        .collect();
     assert_eq!(found, listed);
 }
 
 #[test]
 fn every_kernel_translates_to_every_backend() {
-    for name in KERNELS {
-        let (module, info) = resolved(&source(name)).unwrap_or_else(|e| panic!("{name}: {e}"));
+    for (name, text) in compositions() {
+        let (module, info) = resolved(&text).unwrap_or_else(|e| panic!("{name}: {e}"));
         translate(&module, &info).unwrap_or_else(|e| panic!("{name}: {e}"));
     }
 }
 
 #[test]
-fn every_kernel_begins_with_its_purpose_and_computes() {
+fn every_kernel_begins_with_its_purpose() {
+    for name in KERNELS.iter().flat_map(|(files, _)| *files) {
+        assert!(source(name).starts_with("// "), "{name}: no purpose");
+    }
+}
+
+#[test]
+fn every_kernel_computes() {
     // The recorder's shader is the only one that draws.
-    for name in KERNELS {
-        let text = source(name);
-        assert!(text.starts_with("// "), "{name}: no purpose");
+    for (name, text) in compositions() {
         let (module, _) = resolved(&text).unwrap();
         let stages: Vec<_> = module.entry_points.iter().map(|e| e.stage).collect();
         assert!(!stages.is_empty(), "{name}: no entry point");
         let computes = stages.iter().all(|&stage| stage == ShaderStage::Compute);
-        assert_eq!(computes, name != "render", "{name}");
+        assert_eq!(computes, !name.contains("render"), "{name}");
     }
 }
 
 #[test]
 fn a_wrong_kernel_is_noticed() {
-    let broken = source("conv2d").replace("vec4(0.0)", "vec3(0.0)");
-    assert!(resolved(&broken).is_err());
+    let right = kernel_text(Some(Buffer), &[], &source("conv2d_buffer"));
+    resolved(&right).unwrap();
+    assert!(resolved(&right.replace("vec4(0.0)", "vec3(0.0)")).is_err());
 }

@@ -1,4 +1,4 @@
-use super::step::Step;
+use super::step::{Step, Tensors};
 use super::tensor::Tensor;
 use super::{Device, GpuError};
 
@@ -9,16 +9,14 @@ pub(super) fn back_project(
     input: &Tensor,
     output: &Tensor,
 ) -> Result<Step, GpuError> {
-    let joints = input.shape.channels / 3;
-    Step::from_to(
+    Step::by_texel(
         device,
         label,
         (
             "back_project",
             include_str!("../../shaders/back_project.wgsl"),
         ),
-        &[("JOINTS", joints as f64), ("BATCH", input.batch as f64)],
-        (input, output),
-        input.batch * joints,
+        &[("JOINTS", (input.shape.channels / 3) as f64)],
+        Tensors::from_to(input, output),
     )
 }

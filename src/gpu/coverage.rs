@@ -1,6 +1,6 @@
 use bytemuck::{Pod, Zeroable};
 
-use super::step::{Step, StepDescriptor, Work};
+use super::step::{Step, StepDescriptor, Tensors, Work};
 use super::tensor::Tensor;
 use super::{Device, GpuError};
 use crate::network::Coverage;
@@ -48,7 +48,6 @@ pub fn coverage(
     totals: &wgpu::Buffer,
     (threshold, sure_threshold): (f32, f32),
 ) -> Result<Step, GpuError> {
-    let (height, width) = (mask.shape.height, mask.shape.width);
     Step::new(
         device,
         &StepDescriptor {
@@ -56,18 +55,14 @@ pub fn coverage(
             kernel: "coverage",
             source: include_str!("../../shaders/coverage.wgsl"),
             entry_point: "main",
+            tensors: Tensors::from(mask),
             constants: &[
-                ("WIDTH", width as f64),
-                ("HEIGHT", height as f64),
-                ("BATCH", mask.batch as f64),
                 ("THRESHOLD", f64::from(threshold)),
                 ("SURE_THRESHOLD", f64::from(sure_threshold)),
             ],
-            bindings: &[
-                (0, mask.buffer.as_entire_binding()),
-                (1, totals.as_entire_binding()),
-            ],
-            workgroups: mask.batch * (height * width).div_ceil(256),
+            sizes: &[],
+            bindings: &[(3, totals.as_entire_binding())],
+            workgroups: mask.batch * (mask.shape.height * mask.shape.width).div_ceil(256),
             work: Work {
                 operations: 0,
                 bytes: mask.bytes() + totals.size(),

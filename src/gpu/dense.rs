@@ -1,4 +1,4 @@
-use super::step::{Step, StepDescriptor, Work, activation_constant};
+use super::step::{Step, StepDescriptor, Tensors, Work, activation_number};
 use super::tensor::{Tensor, constant_buffer, pack, storage_buffer};
 use super::{Device, GpuError};
 use crate::network::{Activation, Parameters};
@@ -15,8 +15,12 @@ pub(super) fn dense(
 ) -> Result<[Step; 2], GpuError> {
     let outputs = output.shape.channels;
     let length = input.texels() / input.batch;
-    // Each row of the weight lies as the input does.
-    let weights = pack(&parameters.weight, input.shape);
+    // Each row of the weight lies as an image of the input does.
+    let weights: Vec<f32> = parameters
+        .weight
+        .chunks_exact(input.shape.len())
+        .flat_map(|row| pack(row, input.shape, 1))
+        .collect();
     let weights = constant_buffer(device, &format!("{label}: weight"), &weights)?;
     let bias = constant_buffer(device, &format!("{label}: bias"), &parameters.bias)?;
     // Some thousand texels a workgroup: enough to hide its reduction, and enough workgroups.
@@ -25,11 +29,9 @@ pub(super) fn dense(
     let partials = storage_buffer(device, &format!("{label}: partial sums"), 4 * sums as u64)?;
     let source = include_str!("../../shaders/dense.wgsl");
     let constants = &[
-        ("LENGTH", length as f64),
         ("OUTPUTS", outputs as f64),
-        ("BATCH", input.batch as f64),
         ("SEGMENTS", segments as f64),
-        ("ACTIVATION", activation_constant(activation)),
+        ("ACTIVATION", activation_number(activation).into()),
     ];
     let partial = Step::new(
         device,
@@ -38,17 +40,19 @@ pub(super) fn dense(
             kernel: "dense",
             source,
             entry_point: "partial",
+            tensors: Tensors::from(input),
             constants,
+            sizes: &[],
             bindings: &[
-                (0, input.buffer.as_entire_binding()),
-                (1, weights.as_entire_binding()),
-                (2, partials.as_entire_binding()),
+                (3, weights.as_entire_binding()),
+                (4, partials.as_entire_binding()),
             ],
             workgroups: sums,
-            work: Work {
-                operations: 2 * (input.batch * parameters.weight.len()) as u64,
-                bytes: input.bytes() + 4 * (parameters.weight.len() + sums) as u64,
-            },
+            work: Work::new(
+                Tensors::from(input),
+                parameters.weight.len() + sums,
+                input.batch * parameters.weight.len(),
+            ),
         },
     )?;
     let finish = Step::new(
@@ -58,17 +62,15 @@ pub(super) fn dense(
             kernel: "dense",
             source,
             entry_point: "finish",
+            tensors: Tensors::to(output),
             constants,
+            sizes: &[],
             bindings: &[
-                (2, partials.as_entire_binding()),
-                (3, bias.as_entire_binding()),
-                (4, output.buffer.as_entire_binding()),
+                (4, partials.as_entire_binding()),
+                (5, bias.as_entire_binding()),
             ],
-            workgroups: (input.batch * outputs).div_ceil(64),
-            work: Work {
-                operations: 0,
-                bytes: output.bytes() + 4 * (sums + parameters.bias.len()) as u64,
-            },
+            workgroups: output.planes().div_ceil(64),
+            work: Work::new(Tensors::to(output), sums + parameters.bias.len(), 0),
         },
     )?;
     Ok([partial, finish])

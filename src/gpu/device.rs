@@ -1,9 +1,10 @@
+use std::collections::HashMap;
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError, mpsc};
 use std::time::Duration;
 
 use super::adapter::{self, AdapterRequest, Choice};
-use super::{GpuError, Tier};
+use super::{GpuError, Layout, Tier};
 
 /// A wgpu device and queue of our own, whose errors come back as values.
 ///
@@ -16,8 +17,12 @@ pub struct Device {
     tier: Tier,
     choice: Choice,
     fault: Arc<Mutex<Option<GpuError>>>,
+    pipelines: Mutex<HashMap<PipelineKey, wgpu::ComputePipeline>>,
     _instance: wgpu::Instance,
 }
+
+/// A kernel's text, its entry point, and the bits of its constants.
+type PipelineKey = (String, String, Vec<(String, u64)>);
 
 impl fmt::Debug for Device {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -35,7 +40,8 @@ impl Device {
     pub const TIMEOUT: Duration = Duration::from_secs(60);
 
     /// What is asked for where the adapter has it.
-    const FEATURES: wgpu::Features = wgpu::Features::TIMESTAMP_QUERY;
+    const FEATURES: wgpu::Features =
+        wgpu::Features::SUBGROUP.union(wgpu::Features::TIMESTAMP_QUERY);
 
     /// Opens the adapter that `request` leads to.
     ///
@@ -78,6 +84,7 @@ impl Device {
             info,
             choice,
             fault,
+            pipelines: Mutex::default(),
             _instance: instance,
         })
     }
@@ -102,9 +109,65 @@ impl Device {
         self.tier
     }
 
+    /// How tensors lie in its memory, unless asked otherwise.
+    pub fn layout(&self) -> Layout {
+        Layout::of(&self.info)
+    }
+
+    /// Invocations in its smallest subgroups; `None` where kernels cannot use subgroups.
+    pub fn subgroup_size(&self) -> Option<u32> {
+        let usable = self.device.features().contains(wgpu::Features::SUBGROUP);
+        usable.then_some(self.info.subgroup_min_size)
+    }
+
     /// Why this adapter was chosen.
     pub fn choice(&self) -> &Choice {
         &self.choice
+    }
+
+    /// The pipeline of a kernel, made once for each text and set of constants: compiling is dear, and
+    /// many layers differ by what they bind only. Driver errors reach the caller's
+    /// [`Device::scoped`].
+    pub(super) fn pipeline(
+        &self,
+        label: &str,
+        text: String,
+        entry_point: &str,
+        constants: &[(&str, f64)],
+    ) -> wgpu::ComputePipeline {
+        let bits = constants
+            .iter()
+            .map(|(name, value)| ((*name).to_owned(), value.to_bits()))
+            .collect();
+        let key = (text, entry_point.to_owned(), bits);
+        let mut pipelines = self
+            .pipelines
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        if let Some(pipeline) = pipelines.get(&key) {
+            return pipeline.clone();
+        }
+        let module = self
+            .device
+            .create_shader_module(wgpu::ShaderModuleDescriptor {
+                label: Some(label),
+                source: wgpu::ShaderSource::Wgsl(key.0.as_str().into()),
+            });
+        let pipeline = self
+            .device
+            .create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+                label: Some(label),
+                layout: None,
+                module: &module,
+                entry_point: Some(entry_point),
+                compilation_options: wgpu::PipelineCompilationOptions {
+                    constants,
+                    ..Default::default()
+                },
+                cache: None,
+            });
+        pipelines.insert(key, pipeline.clone());
+        pipeline
     }
 
     /// Gives the first fault that happened since the device was opened.

@@ -57,6 +57,14 @@ pub enum GpuError {
     /// A network that cannot be planned.
     #[error("{0}")]
     Network(Arc<NetworkError>),
+    /// A kernel that was asked for does not serve a layer, or not on this adapter.
+    #[error("{layer}: `{wanted}` does not serve this layer here")]
+    Kernel {
+        /// Network and layer.
+        layer: String,
+        /// The kernel's name.
+        wanted: String,
+    },
     /// The data does not have the size that the plan was made for.
     #[error("{what}: expected {expected} values, found {found}")]
     Size {

@@ -1,5 +1,5 @@
-use super::step::Step;
-use super::tensor::{Tensor, blocks};
+use super::step::{Step, Tensors};
+use super::tensor::Tensor;
 use super::{Device, GpuError};
 
 /// Maximum over windows of `size` x `size`, side by side (`shaders/max_pool2d.wgsl`).
@@ -10,18 +10,11 @@ pub(super) fn max_pool2d(
     output: &Tensor,
     size: usize,
 ) -> Result<Step, GpuError> {
-    let planes = input.batch * blocks(input.shape.channels);
-    Step::from_to(
+    Step::by_texel(
         device,
         label,
         ("max_pool2d", include_str!("../../shaders/max_pool2d.wgsl")),
-        &[
-            ("PLANES", planes as f64),
-            ("IN_HEIGHT", input.shape.height as f64),
-            ("IN_WIDTH", input.shape.width as f64),
-            ("SIZE", size as f64),
-        ],
-        (input, output),
-        output.texels(),
+        &[("SIZE", size as f64)],
+        Tensors::from_to(input, output),
     )
 }

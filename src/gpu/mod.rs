@@ -2,12 +2,14 @@
 
 mod adapter;
 mod back_project;
+mod choice;
 mod concat;
 mod conv2d;
 mod coverage;
 mod dense;
 mod device;
 mod error;
+mod layout;
 mod max_pool2d;
 mod network;
 mod overlay;
@@ -18,15 +20,18 @@ mod sigmoid;
 mod soft_argmax2d;
 mod step;
 mod tensor;
+mod text;
 mod tier;
 mod upsample2d;
 
 pub use adapter::{
     AdapterReport, AdapterRequest, Choice, Wanted, device_type, driver, list_adapters,
 };
+pub use choice::Conv2dKernel;
 pub use coverage::{Totals, coverage};
 pub use device::Device;
 pub use error::GpuError;
+pub use layout::Layout;
 pub use network::NetworkPlan;
 pub use overlay::overlay;
 pub use plan::{Frame, Plan};
@@ -34,4 +39,5 @@ pub use probe::{ArithmeticProbe, copy_probe};
 pub use rectify::Rectify;
 pub use step::{Step, Work};
 pub use tensor::Tensor;
+pub use text::kernel_text;
 pub use tier::Tier;

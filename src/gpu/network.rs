@@ -1,6 +1,7 @@
 use super::back_project::back_project;
+use super::choice::{Conv2dKernel, conv2d};
 use super::concat::concat;
-use super::conv2d::conv2d;
+use super::conv2d::{Conv2d, margin};
 use super::dense::dense;
 use super::max_pool2d::max_pool2d;
 use super::sigmoid::sigmoid;
@@ -8,8 +9,8 @@ use super::soft_argmax2d::soft_argmax2d;
 use super::step::Step;
 use super::tensor::Tensor;
 use super::upsample2d::upsample2d;
-use super::{Device, GpuError};
-use crate::network::{Network, NetworkError, Node, Operation, Parameters, Source};
+use super::{Device, GpuError, Layout};
+use crate::network::{Network, NetworkError, Node, Operation, Parameters, Shape, Source};
 
 /// A network planned for a batch: every layer's output allocated, every kernel compiled and bound.
 #[derive(Debug)]
@@ -21,8 +22,24 @@ pub struct NetworkPlan {
 }
 
 impl NetworkPlan {
-    /// Plans `network` to read `input`, whose shape must be the network's. `name` goes before the
-    /// layers' names in errors and labels.
+    /// Allocates an input for `network` in `layout`, with the margin that its layers want. `what` names it in errors.
+    ///
+    /// # Errors
+    /// As [`Tensor::new`].
+    pub fn input(
+        device: &Device,
+        layout: Layout,
+        what: &str,
+        network: &Network,
+        batch: usize,
+    ) -> Result<Tensor, GpuError> {
+        let margin = margin_of(network, &[Source::Input]);
+        Tensor::in_layout(device, layout, what, network.input(), batch, margin)
+    }
+
+    /// Plans `network` to read `input`, whose shape must be the network's, and whose margin must be
+    /// that of [`NetworkPlan::input`] or wider. All tensors get the layout of `input`. `name` goes
+    /// before the layers' names in errors and labels.
     ///
     /// # Errors
     /// A layer that exceeds the adapter's limits, or a driver's refusal.
@@ -32,19 +49,49 @@ impl NetworkPlan {
         network: &Network,
         input: &Tensor,
     ) -> Result<Self, GpuError> {
+        Self::with_kernel(device, name, network, input, None)
+    }
+
+    /// As [`NetworkPlan::new`], with all convolutions by one `kernel`, if it is given.
+    ///
+    /// # Errors
+    /// Those, and [`GpuError::Kernel`] where that kernel does not serve a layer.
+    pub fn with_kernel(
+        device: &Device,
+        name: &str,
+        network: &Network,
+        input: &Tensor,
+        kernel: Option<Conv2dKernel>,
+    ) -> Result<Self, GpuError> {
+        let size = |what, expected, found| {
+            Err(GpuError::Size {
+                what,
+                expected,
+                found,
+            })
+        };
         if input.shape != network.input() {
-            return Err(GpuError::Size {
-                what: "network input",
-                expected: network.input().len(),
-                found: input.shape.len(),
-            });
+            return size("network input", network.input().len(), input.shape.len());
+        }
+        let wanted = margin_of(network, &[Source::Input]);
+        if let Some(found) = input.margin().filter(|&found| found < wanted) {
+            return size("margin of the network input", wanted, found);
         }
         device.scoped(|| {
+            let places = places(device, name, network, input)?;
             let mut steps = Vec::new();
             let mut outputs: Vec<Tensor> = Vec::with_capacity(network.nodes().len());
-            for node in network.nodes() {
+            for (index, (node, place)) in network.nodes().iter().zip(places).enumerate() {
                 let label = format!("{name}.{}", node.layer.name);
-                let output = Tensor::new(device, &label, node.output, input.batch)?;
+                let placed = place.is_some();
+                let allocate = |what: &str, shape, readers: &[Source]| {
+                    let margin = margin_of(network, readers);
+                    Tensor::in_layout(device, input.layout(), what, shape, input.batch, margin)
+                };
+                let output = match place {
+                    Some(place) => place,
+                    None => allocate(&label, node.output, &[Source::Layer(index)])?,
+                };
                 let sources: Vec<&Tensor> = node
                     .sources
                     .iter()
@@ -56,17 +103,22 @@ impl NetworkPlan {
                 let source = sources.first().copied().unwrap_or(input);
                 match node.layer.operation {
                     Operation::Conv2d {
-                        kernel,
+                        kernel: side,
                         dilation,
                         activation,
                         ..
                     } => steps.push(conv2d(
                         device,
-                        &label,
-                        source,
-                        &output,
-                        parameters(node)?,
-                        (kernel, dilation, activation),
+                        &Conv2d {
+                            label: &label,
+                            input: source,
+                            output: &output,
+                            parameters: parameters(node)?,
+                            kernel: side,
+                            dilation,
+                            activation,
+                        },
+                        kernel,
                     )?),
                     Operation::MaxPool2d { size } => {
                         steps.push(max_pool2d(device, &label, source, &output, size)?);
@@ -83,7 +135,25 @@ impl NetworkPlan {
                     Operation::Upsample2d { scale } => {
                         steps.push(upsample2d(device, &label, source, &output, scale)?);
                     }
-                    Operation::Concat => steps.extend(concat(device, &label, &sources, &output)?),
+                    // Its inputs are written to their places by those who make them.
+                    Operation::Concat if placed => {}
+                    Operation::Concat => {
+                        let mut all = source.clone();
+                        for (number, next) in sources.iter().enumerate().skip(1) {
+                            let joined = if number + 1 == sources.len() {
+                                output.clone()
+                            } else {
+                                let channels = all.shape.channels + next.shape.channels;
+                                let shape = Shape {
+                                    channels,
+                                    ..node.output
+                                };
+                                allocate(&label, shape, &[])?
+                            };
+                            steps.push(concat(device, &label, &all, next, &joined)?);
+                            all = joined;
+                        }
+                    }
                     Operation::SoftArgmax2d { origin, step } => {
                         let votes = sources.get(1).copied().unwrap_or(input);
                         steps.push(soft_argmax2d(
@@ -149,4 +219,76 @@ fn parameters(node: &Node) -> Result<&Parameters, NetworkError> {
         layer: node.layer.name.clone(),
         problem: "parameters: expected weight and bias, found none".into(),
     })
+}
+
+/// How far the layers that read one of `sources` reach beyond its rows and columns.
+fn margin_of(network: &Network, sources: &[Source]) -> usize {
+    let reads = |node: &&Node| node.sources.iter().any(|source| sources.contains(source));
+    let margins = network
+        .nodes()
+        .iter()
+        .filter(reads)
+        .map(|node| match node.layer.operation {
+            Operation::Conv2d {
+                kernel, dilation, ..
+            } => margin(node.input, kernel, dilation),
+            _ => 0,
+        });
+    margins.max().unwrap_or(0)
+}
+
+/// The outputs that lie in memory of others, by layer: those of concatenations whose inputs can be
+/// written to their places by the layers that make them, and of these layers.
+fn places(
+    device: &Device,
+    name: &str,
+    network: &Network,
+    input: &Tensor,
+) -> Result<Vec<Option<Tensor>>, GpuError> {
+    let nodes = network.nodes();
+    let mut places: Vec<Option<Tensor>> = vec![None; nodes.len()];
+    for (index, node) in nodes.iter().enumerate() {
+        if node.layer.operation != Operation::Concat {
+            continue;
+        }
+        let mut readers = node.sources.clone();
+        readers.push(Source::Layer(index));
+        let all = Tensor::in_layout(
+            device,
+            input.layout(),
+            &format!("{name}.{}", node.layer.name),
+            node.output,
+            input.batch,
+            margin_of(network, &readers),
+        )?;
+        let mut first = 0;
+        let mut parts = Vec::with_capacity(node.sources.len());
+        for &source in &node.sources {
+            let Source::Layer(maker) = source else { break };
+            let Some(made) = nodes.get(maker) else { break };
+            // Every output is in one place, whole blocks from the others; and what reads a buffer
+            // cannot write to it.
+            let taken = places.get(maker).is_some_and(Option::is_some)
+                || parts.iter().any(|(other, _)| *other == maker)
+                || made.layer.operation == Operation::Concat
+                || (input.margin().is_none() && made.sources.iter().any(|s| readers.contains(s)));
+            if taken || first % 4 != 0 {
+                break;
+            }
+            let Some(part) = all.slice(device, first, made.output.channels) else {
+                break;
+            };
+            parts.push((maker, part));
+            first += made.output.channels;
+        }
+        if parts.len() < node.sources.len() {
+            continue;
+        }
+        for (maker, part) in parts.into_iter().chain([(index, all)]) {
+            if let Some(place) = places.get_mut(maker) {
+                *place = Some(part);
+            }
+        }
+    }
+    Ok(places)
 }

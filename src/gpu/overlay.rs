@@ -1,4 +1,4 @@
-use super::step::{Step, StepDescriptor, Work};
+use super::step::{Step, Tensors};
 use super::tensor::Tensor;
 use super::{Device, GpuError};
 use crate::network::Overlay;
@@ -19,25 +19,14 @@ pub fn overlay(
         Overlay::Multiply {} => (true, 0.0),
         Overlay::Threshold { threshold } => (false, threshold),
     };
-    Step::new(
+    Step::by_texel(
         device,
-        &StepDescriptor {
-            label: "overlay",
-            kernel: "overlay",
-            source: include_str!("../../shaders/overlay.wgsl"),
-            entry_point: "main",
-            constants: &[
-                ("PIXELS", mask.texels() as f64),
-                ("SOFT", f64::from(u8::from(soft))),
-                ("THRESHOLD", f64::from(threshold)),
-            ],
-            bindings: &[
-                (0, image.buffer.as_entire_binding()),
-                (1, mask.buffer.as_entire_binding()),
-                (2, output.buffer.as_entire_binding()),
-            ],
-            workgroups: mask.texels().div_ceil(64),
-            work: Work::new(&[image, mask], 0, 0, output),
-        },
+        "overlay",
+        ("overlay", include_str!("../../shaders/overlay.wgsl")),
+        &[
+            ("SOFT", f64::from(u8::from(soft))),
+            ("THRESHOLD", f64::from(threshold)),
+        ],
+        Tensors::both_to(image, mask, output),
     )
 }

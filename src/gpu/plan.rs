@@ -4,7 +4,7 @@ use super::coverage::{Totals, coverage};
 use super::overlay::overlay;
 use super::rectify::Rectify;
 use super::step::Step;
-use super::tensor::{Tensor, blocks, staging_buffer, storage_buffer, unpack};
+use super::tensor::{Tensor, staging_buffer, storage_buffer};
 use super::{Device, GpuError, NetworkPlan};
 use crate::camera::Rectification;
 use crate::network::{Coverage, Model};
@@ -21,7 +21,6 @@ pub struct Plan {
     totals: wgpu::Buffer,
     overlay: Step,
     joint: NetworkPlan,
-    joint_values: usize,
     results: wgpu::Buffer,
     masks: wgpu::Buffer,
 }
@@ -44,14 +43,15 @@ impl Plan {
     /// A layer that exceeds the adapter's limits, or a driver's refusal.
     pub fn new(device: &Device, model: &Model, batch: usize) -> Result<Self, GpuError> {
         let description = &model.description;
-        let shape = model.mask_network.input();
+        let layout = device.layout();
         device.scoped(|| {
-            let image = Tensor::new(device, "image", shape, batch)?;
+            let image = NetworkPlan::input(device, layout, "image", &model.mask_network, batch)?;
             let rectify = (0..batch)
                 .map(|_| Rectify::new(device, &image))
                 .collect::<Result<_, _>>()?;
             let mask = NetworkPlan::new(device, "mask", &model.mask_network, &image)?;
-            let masked = Tensor::new(device, "overlay", shape, batch)?;
+            let masked =
+                NetworkPlan::input(device, layout, "overlay", &model.joint_network, batch)?;
             let joint = NetworkPlan::new(device, "joint", &model.joint_network, &masked)?;
             let totals = storage_buffer(
                 device,
@@ -63,15 +63,14 @@ impl Plan {
             let thresholds = (presence.mask_threshold, presence.sure_threshold);
             let coverage = coverage(device, output, &totals, thresholds)?;
             let overlay = overlay(device, &image, output, &masked, description.overlay)?;
-            let results = staging_buffer(device, totals.size() + joint.output().buffer.size());
-            let masks = staging_buffer(device, output.buffer.size());
+            let results = staging_buffer(device, joint.output().staging_size() + totals.size());
+            let masks = staging_buffer(device, output.staging_size());
             Ok(Self {
                 image,
                 rectify,
                 coverage,
                 totals,
                 overlay,
-                joint_values: model.joint_network.output().len(),
                 results,
                 masks,
                 mask,
@@ -149,15 +148,14 @@ impl Plan {
             step.encode(&mut pass);
         }
         drop(pass);
-        let joints = &self.joint.output().buffer;
-        let masks = &self.mask.output().buffer;
-        let totals = self.totals.size();
-        encoder.copy_buffer_to_buffer(&self.totals, 0, &self.results, 0, totals);
+        let joints = self.joint.output();
+        let (after_joints, totals) = (joints.staging_size(), self.totals.size());
         if with_joints {
-            encoder.copy_buffer_to_buffer(joints, 0, &self.results, totals, joints.size());
+            joints.copy_to(encoder, &self.results, 0);
         }
+        encoder.copy_buffer_to_buffer(&self.totals, 0, &self.results, after_joints, totals);
         if with_mask {
-            encoder.copy_buffer_to_buffer(masks, 0, &self.masks, 0, masks.size());
+            self.mask.output().copy_to(encoder, &self.masks, 0);
         }
     }
 
@@ -171,13 +169,13 @@ impl Plan {
         with_joints: bool,
         with_mask: bool,
     ) -> Result<Vec<Frame>, GpuError> {
-        let totals = self.totals.size();
+        let after_joints = self.joint.output().staging_size();
         let shape = self.image.shape;
         let (width, height) = (shape.width as u32, shape.height as u32);
         let mut frames = device.read(&self.results, |bytes| {
-            let (all_totals, all_joints) = bytes.split_at(totals as usize);
-            let joints = self.joints_in(all_joints);
-            all_totals
+            let (joints, totals) = bytes.split_at(after_joints as usize);
+            let joints = self.joints_in(joints);
+            totals
                 .chunks_exact(size_of::<Totals>())
                 .zip(joints)
                 .map(|(totals, joints)| Frame {
@@ -189,12 +187,7 @@ impl Plan {
                 .collect::<Vec<_>>()
         })?;
         if with_mask {
-            let values = device.read(&self.masks, |bytes| {
-                unpack(
-                    &bytemuck::pod_collect_to_vec(bytes),
-                    self.mask.output().shape,
-                )
-            })?;
+            let values = device.read(&self.masks, |bytes| self.mask.output().values(bytes))?;
             let plane = shape.height * shape.width;
             for (frame, mask) in frames.iter_mut().zip(values.chunks_exact(plane)) {
                 frame.mask = mask.to_vec();
@@ -222,23 +215,19 @@ impl Plan {
         self.overlay.encode(&mut pass);
         self.joint.encode(&mut pass);
         drop(pass);
-        let joints = &self.joint.output().buffer;
-        let totals = self.totals.size();
-        encoder.copy_buffer_to_buffer(joints, 0, &self.results, totals, joints.size());
+        let joints = self.joint.output();
+        joints.copy_to(&mut encoder, &self.results, 0);
         device.queue().submit([encoder.finish()]);
-        device.read(&self.results, |bytes| {
-            let (_, joints) = bytes.split_at(totals as usize);
-            self.joints_in(joints).collect()
-        })
+        device.read(&self.results, |bytes| self.joints_in(bytes))
     }
 
-    /// Each image's joints in the joint network's output as it lies in memory.
-    fn joints_in<'a>(&self, bytes: &'a [u8]) -> impl Iterator<Item = Vec<f32>> + use<'a> {
-        let count = self.joint_values;
-        bytes.chunks_exact(16 * blocks(count)).map(move |joints| {
-            let mut joints = bytemuck::pod_collect_to_vec::<u8, f32>(joints);
-            joints.truncate(count);
-            joints
-        })
+    /// Each image's joints at the beginning of the results as they were copied.
+    fn joints_in(&self, bytes: &[u8]) -> Vec<Vec<f32>> {
+        let output = self.joint.output();
+        let values = output.values(bytes);
+        values
+            .chunks_exact(output.shape.channels)
+            .map(<[f32]>::to_vec)
+            .collect()
     }
 }

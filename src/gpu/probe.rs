@@ -1,4 +1,4 @@
-use super::step::{Step, StepDescriptor, Work};
+use super::step::{Step, StepDescriptor, Tensors, Work};
 use super::tensor::storage_buffer;
 use super::{Device, GpuError};
 
@@ -31,6 +31,8 @@ impl ArithmeticProbe {
                     kernel: "probe_arithmetic",
                     source: include_str!("../../shaders/probe_arithmetic.wgsl"),
                     entry_point: "main",
+                    tensors: Tensors::default(),
+                    sizes: &[],
                     constants: &[],
                     bindings: &[
                         (0, params.as_entire_binding()),
@@ -82,6 +84,8 @@ pub fn copy_probe(device: &Device) -> Result<Step, GpuError> {
                 kernel: "probe_copy",
                 source: include_str!("../../shaders/probe_copy.wgsl"),
                 entry_point: "main",
+                tensors: Tensors::default(),
+                sizes: &[],
                 constants: &[("LENGTH", length as f64)],
                 bindings: &[
                     (0, input.as_entire_binding()),

@@ -1,6 +1,6 @@
 use image::RgbaImage;
 
-use super::step::{Step, StepDescriptor, Work};
+use super::step::{Step, StepDescriptor, Tensors, Work};
 use super::tensor::Tensor;
 use super::{Device, GpuError};
 use crate::camera::Rectification;
@@ -36,8 +36,10 @@ impl Rectify {
                 kernel: "rectify",
                 source: include_str!("../../shaders/rectify.wgsl"),
                 entry_point: "main",
-                constants: &[("WIDTH", width as f64), ("HEIGHT", height as f64)],
-                bindings: &bindings(&view, &params, output),
+                tensors: Tensors::to(output),
+                constants: &[],
+                sizes: &[],
+                bindings: &bindings(&view, &params),
                 workgroups: (height * width).div_ceil(64),
                 work: work(&texture, output),
             },
@@ -66,7 +68,8 @@ impl Rectify {
             let view = self.texture.create_view(&Default::default());
             self.step.rebind(
                 device,
-                &bindings(&view, &self.params, output),
+                Tensors::to(output),
+                &bindings(&view, &self.params),
                 work(&self.texture, output),
             );
         }
@@ -104,12 +107,10 @@ fn work(source: &wgpu::Texture, output: &Tensor) -> Work {
 fn bindings<'a>(
     view: &'a wgpu::TextureView,
     params: &'a wgpu::Buffer,
-    output: &'a Tensor,
-) -> [(u32, wgpu::BindingResource<'a>); 3] {
+) -> [(u32, wgpu::BindingResource<'a>); 2] {
     [
-        (0, wgpu::BindingResource::TextureView(view)),
-        (1, params.as_entire_binding()),
-        (2, output.buffer.as_entire_binding()),
+        (3, wgpu::BindingResource::TextureView(view)),
+        (4, params.as_entire_binding()),
     ]
 }
 
@@ -128,7 +129,7 @@ fn texture(device: &Device, width: u32, height: u32) -> Result<wgpu::Texture, Gp
         sample_count: 1,
         dimension: wgpu::TextureDimension::D2,
         format: wgpu::TextureFormat::Rgba8Unorm,
-        usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
+        usage: wgpu::TextureUsages::STORAGE_BINDING | wgpu::TextureUsages::COPY_DST,
         view_formats: &[],
     }))
 }

@@ -1,4 +1,4 @@
-use super::step::Step;
+use super::step::{Step, Tensors};
 use super::tensor::Tensor;
 use super::{Device, GpuError};
 
@@ -9,12 +9,11 @@ pub(super) fn sigmoid(
     input: &Tensor,
     output: &Tensor,
 ) -> Result<Step, GpuError> {
-    Step::from_to(
+    Step::by_texel(
         device,
         label,
         ("sigmoid", include_str!("../../shaders/sigmoid.wgsl")),
-        &[("LENGTH", input.texels() as f64)],
-        (input, output),
-        input.texels(),
+        &[],
+        Tensors::from_to(input, output),
     )
 }

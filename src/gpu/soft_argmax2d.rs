@@ -1,4 +1,4 @@
-use super::step::{Step, StepDescriptor, Work};
+use super::step::{Step, StepDescriptor, Tensors, Work};
 use super::tensor::Tensor;
 use super::{Device, GpuError};
 
@@ -13,7 +13,7 @@ pub(super) fn soft_argmax2d(
     origin: [f32; 2],
     step: [f32; 2],
 ) -> Result<Step, GpuError> {
-    let joints = heat.shape.channels;
+    let tensors = Tensors::both_to(heat, votes, output);
     Step::new(
         device,
         &StepDescriptor {
@@ -21,23 +21,18 @@ pub(super) fn soft_argmax2d(
             kernel: "soft_argmax2d",
             source: include_str!("../../shaders/soft_argmax2d.wgsl"),
             entry_point: "main",
+            tensors,
             constants: &[
-                ("JOINTS", joints as f64),
-                ("BATCH", heat.batch as f64),
-                ("HEIGHT", heat.shape.height as f64),
-                ("WIDTH", heat.shape.width as f64),
+                ("JOINTS", heat.shape.channels as f64),
                 ("ORIGIN_X", origin[0].into()),
                 ("ORIGIN_Y", origin[1].into()),
                 ("STEP_X", step[0].into()),
                 ("STEP_Y", step[1].into()),
             ],
-            bindings: &[
-                (0, heat.buffer.as_entire_binding()),
-                (1, votes.buffer.as_entire_binding()),
-                (2, output.buffer.as_entire_binding()),
-            ],
-            workgroups: heat.batch * joints,
-            work: Work::new(&[heat, votes], 0, 0, output),
+            sizes: &[],
+            bindings: &[],
+            workgroups: output.planes(),
+            work: Work::new(tensors, 0, 0),
         },
     )
 }

@@ -1,5 +1,5 @@
 use super::tensor::Tensor;
-use super::{Device, GpuError};
+use super::{Device, GpuError, Layout, kernel_text};
 
 /// One dispatch of a kernel: all that encoding it needs, made once.
 #[derive(Debug)]
@@ -23,12 +23,12 @@ pub struct Work {
 }
 
 impl Work {
-    /// Reads `inputs` and `parameters` values, does `macs` multiply-adds an image, writes `output`.
-    pub(super) fn new(inputs: &[&Tensor], parameters: usize, macs: usize, output: &Tensor) -> Self {
-        let activations: u64 = inputs.iter().map(|input| input.bytes()).sum();
+    /// Reads or writes each of `tensors` and `parameters` values, and does so many `multiply_adds`.
+    pub(super) fn new(tensors: Tensors<'_>, parameters: usize, multiply_adds: usize) -> Self {
+        let activations: u64 = tensors.named().map(|(.., tensor)| tensor.bytes()).sum();
         Self {
-            operations: 2 * (output.batch * macs) as u64,
-            bytes: activations + (4 * parameters) as u64 + output.bytes(),
+            operations: 2 * multiply_adds as u64,
+            bytes: activations + 4 * parameters as u64,
         }
     }
 }
@@ -39,13 +39,17 @@ pub(super) struct StepDescriptor<'a> {
     pub label: &'a str,
     /// The name of the kernel's file in `shaders/`.
     pub kernel: &'static str,
-    /// The kernel's WGSL.
+    /// The kernel's WGSL, to stand behind its layout's.
     pub source: &'a str,
     /// Its entry point.
     pub entry_point: &'a str,
-    /// Values of its `override` constants.
+    /// What it reads and writes by its layout's functions, all in one layout.
+    pub tensors: Tensors<'a>,
+    /// Values of its own `override` constants.
     pub constants: &'a [(&'a str, f64)],
-    /// What it binds, as (binding, resource).
+    /// Values of the constants that it needs where WGSL has no `override`: sizes of arrays.
+    pub sizes: &'a [(&'a str, usize)],
+    /// What else it binds, as (binding, resource).
     pub bindings: &'a [(u32, wgpu::BindingResource<'a>)],
     /// Number of workgroups. The kernel works out its index as `y * num_workgroups.x + x`, and
     /// passes over indices beyond its work.
@@ -54,30 +58,90 @@ pub(super) struct StepDescriptor<'a> {
     pub work: Work,
 }
 
+/// The tensors of a kernel: bindings 0, 1 and 2.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Tensors<'a> {
+    pub input: Option<&'a Tensor>,
+    pub second: Option<&'a Tensor>,
+    pub output: Option<&'a Tensor>,
+}
+
+impl<'a> Tensors<'a> {
+    pub fn from(input: &'a Tensor) -> Self {
+        Self {
+            input: Some(input),
+            ..Self::default()
+        }
+    }
+
+    pub fn to(output: &'a Tensor) -> Self {
+        Self {
+            output: Some(output),
+            ..Self::default()
+        }
+    }
+
+    pub fn from_to(input: &'a Tensor, output: &'a Tensor) -> Self {
+        Self {
+            output: Some(output),
+            ..Self::from(input)
+        }
+    }
+
+    pub fn both_to(input: &'a Tensor, second: &'a Tensor, output: &'a Tensor) -> Self {
+        Self {
+            second: Some(second),
+            ..Self::from_to(input, output)
+        }
+    }
+
+    /// Those that there are, by binding and name.
+    fn named(self) -> impl Iterator<Item = (u32, &'static str, &'a Tensor)> {
+        [
+            (0, "INPUT", self.input),
+            (1, "SECOND", self.second),
+            (2, "OUTPUT", self.output),
+        ]
+        .into_iter()
+        .filter_map(|(binding, name, tensor)| Some((binding, name, tensor?)))
+    }
+
+    /// Empty where there are none: the kernel then uses no layout either.
+    fn constants(self) -> Vec<(String, f64)> {
+        let mut constants = Vec::new();
+        for (_, name, tensor) in self.named() {
+            let values = [
+                ("PLANES", tensor.planes()),
+                ("HEIGHT", tensor.shape.height),
+                ("WIDTH", tensor.shape.width),
+                ("MARGIN", tensor.margin().unwrap_or(0)),
+            ];
+            constants.extend(values.map(|(what, v)| (format!("{name}_{what}"), v as f64)));
+        }
+        if let Some((.., tensor)) = self.named().next() {
+            constants.push(("BATCH".into(), tensor.batch as f64));
+        }
+        constants
+    }
+
+    fn layout(self) -> Option<Layout> {
+        self.named().map(|(.., tensor)| tensor.layout()).next()
+    }
+}
+
 impl Step {
     /// Compiles the kernel and binds its resources. Driver errors reach the caller's
     /// [`Device::scoped`].
     pub(super) fn new(device: &Device, step: &StepDescriptor<'_>) -> Result<Self, GpuError> {
-        let module = device
-            .wgpu()
-            .create_shader_module(wgpu::ShaderModuleDescriptor {
-                label: Some(step.label),
-                source: wgpu::ShaderSource::Wgsl(step.source.into()),
-            });
-        let pipeline = device
-            .wgpu()
-            .create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-                label: Some(step.label),
-                layout: None,
-                module: &module,
-                entry_point: Some(step.entry_point),
-                compilation_options: wgpu::PipelineCompilationOptions {
-                    constants: step.constants,
-                    ..Default::default()
-                },
-                cache: None,
-            });
-        let bind_group = bind(device, &pipeline, step.bindings);
+        let geometry = step.tensors.constants();
+        let constants: Vec<(&str, f64)> = geometry
+            .iter()
+            .map(|(name, value)| (name.as_str(), *value))
+            .chain(step.constants.iter().copied())
+            .collect();
+        let text = kernel_text(step.tensors.layout(), step.sizes, step.source);
+        let pipeline = device.pipeline(step.label, text, step.entry_point, &constants);
+        let bind_group = bind(device, &pipeline, step.tensors, step.bindings);
         // A dimension holds 65,535 workgroups at most: long dispatches are folded into rows.
         let row = device.wgpu().limits().max_compute_workgroups_per_dimension as usize;
         let x = step.workgroups.clamp(1, row);
@@ -97,16 +161,16 @@ impl Step {
         })
     }
 
-    /// A kernel that reads one tensor (binding 0) and writes another (binding 1), 64 of its
-    /// `invocations` a workgroup.
-    pub(super) fn from_to(
+    /// A `kernel` of `source` that binds only `tensors`, and makes a texel of the output an invocation,
+    /// 64 of them a workgroup.
+    pub(super) fn by_texel(
         device: &Device,
         label: &str,
         (kernel, source): (&'static str, &str),
         constants: &[(&str, f64)],
-        (input, output): (&Tensor, &Tensor),
-        invocations: usize,
+        tensors: Tensors<'_>,
     ) -> Result<Self, GpuError> {
+        let texels = tensors.output.map_or(0, Tensor::texels);
         Self::new(
             device,
             &StepDescriptor {
@@ -114,13 +178,12 @@ impl Step {
                 kernel,
                 source,
                 entry_point: "main",
+                tensors,
                 constants,
-                bindings: &[
-                    (0, input.buffer.as_entire_binding()),
-                    (1, output.buffer.as_entire_binding()),
-                ],
-                workgroups: invocations.div_ceil(64),
-                work: Work::new(&[input], 0, 0, output),
+                sizes: &[],
+                bindings: &[],
+                workgroups: texels.div_ceil(64),
+                work: Work::new(tensors, 0, 0),
             },
         )
     }
@@ -144,11 +207,12 @@ impl Step {
     pub(super) fn rebind(
         &mut self,
         device: &Device,
+        tensors: Tensors<'_>,
         bindings: &[(u32, wgpu::BindingResource<'_>)],
         work: Work,
     ) {
         self.work = work;
-        self.bind_group = bind(device, &self.pipeline, bindings);
+        self.bind_group = bind(device, &self.pipeline, tensors, bindings);
     }
 
     /// Records the dispatch.
@@ -163,14 +227,14 @@ impl Step {
 fn bind(
     device: &Device,
     pipeline: &wgpu::ComputePipeline,
+    tensors: Tensors<'_>,
     bindings: &[(u32, wgpu::BindingResource<'_>)],
 ) -> wgpu::BindGroup {
-    let entries: Vec<_> = bindings
-        .iter()
-        .map(|(binding, resource)| wgpu::BindGroupEntry {
-            binding: *binding,
-            resource: resource.clone(),
-        })
+    let entries: Vec<_> = tensors
+        .named()
+        .map(|(binding, _, tensor)| (binding, tensor.resource()))
+        .chain(bindings.iter().cloned())
+        .map(|(binding, resource)| wgpu::BindGroupEntry { binding, resource })
         .collect();
     device.wgpu().create_bind_group(&wgpu::BindGroupDescriptor {
         label: None,
@@ -179,12 +243,12 @@ fn bind(
     })
 }
 
-/// The number that stands for an activation in the kernels' `ACTIVATION` constant.
-pub(super) fn activation_constant(activation: crate::network::Activation) -> f64 {
+/// The number that stands for an activation in the kernels.
+pub(super) fn activation_number(activation: crate::network::Activation) -> u32 {
     use crate::network::Activation;
     match activation {
-        Activation::None => 0.0,
-        Activation::Relu => 1.0,
-        Activation::Sigmoid => 2.0,
+        Activation::None => 0,
+        Activation::Relu => 1,
+        Activation::Sigmoid => 2,
     }
 }

@@ -1,16 +1,32 @@
-use super::{Device, GpuError};
+use super::{Device, GpuError, Layout};
 use crate::network::Shape;
 
-/// A batch of activations on the GPU: `[image][channel / 4][row][column]` of `vec4<f32>`, four
-/// channels side by side. Lanes beyond the last channel are finite and mean nothing.
-#[derive(Debug)]
+/// A batch of activations on the GPU, four channels a texel, in the plan's [`Layout`]. It may be some
+/// of the channels of a larger one: both then share their memory. Lanes beyond the last channel are
+/// finite and mean nothing.
+#[derive(Debug, Clone)]
 pub struct Tensor {
     /// Shape of one image.
     pub shape: Shape,
     /// Number of images.
     pub batch: usize,
-    /// `batch * blocks * height * width` times 16 bytes.
-    pub buffer: wgpu::Buffer,
+    memory: Memory,
+}
+
+#[derive(Debug, Clone)]
+enum Memory {
+    Buffer {
+        buffer: wgpu::Buffer,
+        /// Where it begins, in bytes.
+        offset: u64,
+    },
+    Texture {
+        texture: wgpu::Texture,
+        /// Its layers only.
+        view: wgpu::TextureView,
+        first_layer: u32,
+        margin: u32,
+    },
 }
 
 /// Blocks of four channels that hold `channels`.
@@ -18,25 +34,141 @@ pub fn blocks(channels: usize) -> usize {
     channels.div_ceil(4)
 }
 
+/// Bytes of a texel.
+const TEXEL: usize = 16;
+
 impl Tensor {
-    /// Allocates a tensor, zeroed. `what` names it in errors.
+    /// Allocates a tensor, zeroed, in the device's layout and without a margin. `what` names it in
+    /// errors. What a network reads wants a margin: [`NetworkPlan::input`](super::NetworkPlan::input).
     ///
     /// # Errors
-    /// [`GpuError::Limit`] where the adapter's buffers are too small.
+    /// [`GpuError::Limit`] where the adapter's buffers or textures are too small.
     pub fn new(device: &Device, what: &str, shape: Shape, batch: usize) -> Result<Self, GpuError> {
-        let texels = blocks(shape.channels) as u64 * (shape.height * shape.width) as u64;
-        let size = 16 * batch as u64 * texels;
-        let buffer = storage_buffer(device, what, size)?;
+        Self::in_layout(device, device.layout(), what, shape, batch, 0)
+    }
+
+    /// Allocates a tensor, zeroed, in `layout`. Its readers may reach `margin` texels beyond its
+    /// rows and columns; buffers have no margin, and their kernels look for themselves.
+    ///
+    /// # Errors
+    /// As [`Tensor::new`].
+    pub fn in_layout(
+        device: &Device,
+        layout: Layout,
+        what: &str,
+        shape: Shape,
+        batch: usize,
+        margin: usize,
+    ) -> Result<Self, GpuError> {
+        let planes = blocks(shape.channels) * batch;
+        let memory = match layout {
+            Layout::Buffer => {
+                let texels = planes as u64 * (shape.height * shape.width) as u64;
+                Memory::Buffer {
+                    buffer: storage_buffer(device, what, TEXEL as u64 * texels)?,
+                    offset: 0,
+                }
+            }
+            Layout::Texture => {
+                let [width, height] = [shape.width, shape.height].map(|side| side + 2 * margin);
+                let texture = storage_texture(device, what, [width, height, planes])?;
+                Memory::Texture {
+                    view: layers(&texture, 0, planes as u32),
+                    texture,
+                    first_layer: 0,
+                    margin: margin as u32,
+                }
+            }
+        };
         Ok(Self {
             shape,
             batch,
-            buffer,
+            memory,
         })
     }
 
-    /// Texels (vec4) of the whole batch. Fits 32 bits: the kernels count in them.
+    /// `channels` channels from channel `first` on, a multiple of four; `None` where a buffer cannot
+    /// be bound from there on.
+    pub(super) fn slice(&self, device: &Device, first: usize, channels: usize) -> Option<Self> {
+        let shape = Shape {
+            channels,
+            ..self.shape
+        };
+        let first_plane = first / 4 * self.batch;
+        let planes = blocks(channels) * self.batch;
+        let memory = match &self.memory {
+            Memory::Buffer { buffer, offset } => {
+                let alignment = device.wgpu().limits().min_storage_buffer_offset_alignment;
+                let offset = offset + (TEXEL * first_plane * shape.height * shape.width) as u64;
+                if !offset.is_multiple_of(alignment.into()) {
+                    return None;
+                }
+                Memory::Buffer {
+                    buffer: buffer.clone(),
+                    offset,
+                }
+            }
+            Memory::Texture {
+                texture,
+                first_layer,
+                margin,
+                ..
+            } => {
+                let first_layer = first_layer + first_plane as u32;
+                Memory::Texture {
+                    view: layers(texture, first_layer, planes as u32),
+                    texture: texture.clone(),
+                    first_layer,
+                    margin: *margin,
+                }
+            }
+        };
+        Some(Self {
+            shape,
+            batch: self.batch,
+            memory,
+        })
+    }
+
+    /// How it lies in memory.
+    pub fn layout(&self) -> Layout {
+        match self.memory {
+            Memory::Buffer { .. } => Layout::Buffer,
+            Memory::Texture { .. } => Layout::Texture,
+        }
+    }
+
+    /// How far its readers may reach beyond its rows and columns; `None` for buffers, whose kernels
+    /// look for themselves.
+    pub(super) fn margin(&self) -> Option<usize> {
+        match self.memory {
+            Memory::Buffer { .. } => None,
+            Memory::Texture { margin, .. } => Some(margin as usize),
+        }
+    }
+
+    /// Planes (layers) of the whole batch.
+    pub(super) fn planes(&self) -> usize {
+        self.batch * blocks(self.shape.channels)
+    }
+
+    /// Texels of the whole batch. Fits 32 bits: the kernels count in them.
     pub fn texels(&self) -> usize {
-        self.batch * blocks(self.shape.channels) * self.shape.height * self.shape.width
+        self.planes() * self.shape.height * self.shape.width
+    }
+
+    /// What a kernel binds.
+    pub(super) fn resource(&self) -> wgpu::BindingResource<'_> {
+        match &self.memory {
+            Memory::Buffer { buffer, offset } => {
+                wgpu::BindingResource::Buffer(wgpu::BufferBinding {
+                    buffer,
+                    offset: *offset,
+                    size: wgpu::BufferSize::new((TEXEL * self.texels()) as u64),
+                })
+            }
+            Memory::Texture { view, .. } => wgpu::BindingResource::TextureView(view),
+        }
     }
 
     /// Bytes of the values of the whole batch, without unused lanes.
@@ -57,10 +189,23 @@ impl Tensor {
                 found: values.len(),
             });
         }
-        let packed = pack(values, self.shape);
-        device
-            .queue()
-            .write_buffer(&self.buffer, 0, bytemuck::cast_slice(&packed));
+        let packed = pack(values, self.shape, self.batch);
+        let bytes: &[u8] = bytemuck::cast_slice(&packed);
+        match &self.memory {
+            Memory::Buffer { buffer, offset } => {
+                device.queue().write_buffer(buffer, *offset, bytes);
+            }
+            Memory::Texture { texture, .. } => device.queue().write_texture(
+                self.place(texture),
+                bytes,
+                wgpu::TexelCopyBufferLayout {
+                    offset: 0,
+                    bytes_per_row: Some((TEXEL * self.shape.width) as u32),
+                    rows_per_image: Some(self.shape.height as u32),
+                },
+                self.extent(),
+            ),
+        }
         Ok(())
     }
 
@@ -69,43 +214,125 @@ impl Tensor {
     /// # Errors
     /// As [`Device::read`].
     pub fn read(&self, device: &Device) -> Result<Vec<f32>, GpuError> {
-        let staging = device.scoped(|| Ok(staging_buffer(device, self.buffer.size())))?;
+        let staging = device.scoped(|| Ok(staging_buffer(device, self.staging_size())))?;
         let mut encoder = device.wgpu().create_command_encoder(&Default::default());
-        encoder.copy_buffer_to_buffer(&self.buffer, 0, &staging, 0, self.buffer.size());
+        self.copy_to(&mut encoder, &staging, 0);
         device.queue().submit([encoder.finish()]);
-        device.read(&staging, |bytes| {
-            unpack(&bytemuck::pod_collect_to_vec(bytes), self.shape)
-        })
+        device.read(&staging, |bytes| self.values(bytes))
+    }
+
+    /// Bytes that [`Self::copy_to`] writes.
+    pub(super) fn staging_size(&self) -> u64 {
+        (self.staging_row() * self.planes() * self.shape.height) as u64
+    }
+
+    /// Records a copy to `staging`, from byte `offset` on, a multiple of 256.
+    pub(super) fn copy_to(
+        &self,
+        encoder: &mut wgpu::CommandEncoder,
+        staging: &wgpu::Buffer,
+        offset: u64,
+    ) {
+        match &self.memory {
+            Memory::Buffer {
+                buffer,
+                offset: from,
+            } => {
+                let size = self.staging_size();
+                encoder.copy_buffer_to_buffer(buffer, *from, staging, offset, size);
+            }
+            Memory::Texture { texture, .. } => encoder.copy_texture_to_buffer(
+                self.place(texture),
+                wgpu::TexelCopyBufferInfo {
+                    buffer: staging,
+                    layout: wgpu::TexelCopyBufferLayout {
+                        offset,
+                        bytes_per_row: Some(self.staging_row() as u32),
+                        rows_per_image: Some(self.shape.height as u32),
+                    },
+                },
+                self.extent(),
+            ),
+        }
+    }
+
+    /// `[image][channel][row][column]` values of what [`Self::copy_to`] wrote.
+    pub(super) fn values(&self, bytes: &[u8]) -> Vec<f32> {
+        let row = TEXEL * self.shape.width;
+        let packed: Vec<f32> = bytes
+            .chunks_exact(self.staging_row())
+            .take(self.planes() * self.shape.height)
+            .filter_map(|padded| padded.get(..row))
+            .flat_map(bytemuck::pod_collect_to_vec::<u8, f32>)
+            .collect();
+        unpack(&packed, self.shape, self.batch)
+    }
+
+    /// Bytes of a row in a staging buffer.
+    fn staging_row(&self) -> usize {
+        let row = TEXEL * self.shape.width;
+        match self.memory {
+            Memory::Buffer { .. } => row,
+            Memory::Texture { .. } => {
+                row.next_multiple_of(wgpu::COPY_BYTES_PER_ROW_ALIGNMENT as usize)
+            }
+        }
+    }
+
+    fn place<'a>(&self, texture: &'a wgpu::Texture) -> wgpu::TexelCopyTextureInfo<'a> {
+        let (z, margin) = match self.memory {
+            Memory::Buffer { .. } => (0, 0),
+            Memory::Texture {
+                first_layer,
+                margin,
+                ..
+            } => (first_layer, margin),
+        };
+        wgpu::TexelCopyTextureInfo {
+            origin: wgpu::Origin3d {
+                x: margin,
+                y: margin,
+                z,
+            },
+            ..texture.as_image_copy()
+        }
+    }
+
+    fn extent(&self) -> wgpu::Extent3d {
+        wgpu::Extent3d {
+            width: self.shape.width as u32,
+            height: self.shape.height as u32,
+            depth_or_array_layers: self.planes() as u32,
+        }
     }
 }
 
-/// From `[image][channel][row][column]` to the layout of [`Tensor`], with zeros in unused lanes.
-pub fn pack(values: &[f32], shape: Shape) -> Vec<f32> {
+/// From `[image][channel][row][column]` to the texels of a [`Tensor`]: `[block][image][row][column]`,
+/// zeros in unused lanes.
+pub fn pack(values: &[f32], shape: Shape, batch: usize) -> Vec<f32> {
     let plane = shape.height * shape.width;
-    let mut packed = vec![0.0; values.len() / shape.len() * blocks(shape.channels) * plane * 4];
-    let images = values.chunks_exact(shape.len());
-    let packed_images = packed.chunks_exact_mut(blocks(shape.channels) * plane * 4);
-    for (image, packed) in images.zip(packed_images) {
-        for (index, value) in image.iter().enumerate() {
-            let (channel, pixel) = (index / plane, index % plane);
-            packed[(channel / 4 * plane + pixel) * 4 + channel % 4] = *value;
+    let mut packed = vec![0.0; batch * blocks(shape.channels) * plane * 4];
+    for (image, values) in values.chunks_exact(shape.len()).enumerate() {
+        for (channel, values) in values.chunks_exact(plane).enumerate() {
+            let first = (channel / 4 * batch + image) * plane * 4 + channel % 4;
+            let lanes = packed.iter_mut().skip(first).step_by(4);
+            lanes.zip(values).for_each(|(lane, value)| *lane = *value);
         }
     }
     packed
 }
 
 /// The inverse of [`pack`].
-pub fn unpack(packed: &[f32], shape: Shape) -> Vec<f32> {
+pub fn unpack(packed: &[f32], shape: Shape, batch: usize) -> Vec<f32> {
     let plane = shape.height * shape.width;
-    packed
-        .chunks_exact(blocks(shape.channels) * plane * 4)
-        .flat_map(|image| {
-            (0..shape.len()).map(move |index| {
-                let (channel, pixel) = (index / plane, index % plane);
-                image[(channel / 4 * plane + pixel) * 4 + channel % 4]
-            })
-        })
-        .collect()
+    let mut values = Vec::with_capacity(batch * shape.len());
+    for image in 0..batch {
+        for channel in 0..shape.channels {
+            let first = (channel / 4 * batch + image) * plane * 4 + channel % 4;
+            values.extend(packed.iter().skip(first).step_by(4).take(plane));
+        }
+    }
+    values
 }
 
 /// A storage buffer of `size` bytes, checked against the adapter's limits.
@@ -143,6 +370,97 @@ pub(super) fn constant_buffer(
     Ok(buffer)
 }
 
+/// A uniform buffer that holds `values`, written at the queue's next submission.
+pub(super) fn uniform_buffer(device: &Device, what: &str, values: &[u32]) -> wgpu::Buffer {
+    let bytes: &[u8] = bytemuck::cast_slice(values);
+    let buffer = device.wgpu().create_buffer(&wgpu::BufferDescriptor {
+        label: Some(what),
+        size: bytes.len() as u64,
+        usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+        mapped_at_creation: false,
+    });
+    device.queue().write_buffer(&buffer, 0, bytes);
+    buffer
+}
+
+/// An array of storage textures of `[columns, rows, layers]`, checked against the adapter's limits.
+fn storage_texture(
+    device: &Device,
+    what: &str,
+    [width, height, layers]: [usize; 3],
+) -> Result<wgpu::Texture, GpuError> {
+    let limits = device.wgpu().limits();
+    let side = limits.max_texture_dimension_2d;
+    // Mesa compiles a kernel again for textures of one layer, and for sides that are powers of two:
+    // that takes a second in all, and a texel or a layer too much takes nothing.
+    let [width, height] = [width, height].map(|side| side + usize::from(side.is_power_of_two()));
+    let layers = layers.max(2);
+    let require = |quantity: &str, needed: usize, allowed: u32| {
+        device.require(
+            &format!("{what}: {quantity}"),
+            needed as u64,
+            allowed.into(),
+        )
+    };
+    require("texels along a side", width.max(height), side)?;
+    require(
+        "layers of a texture",
+        layers,
+        limits.max_texture_array_layers,
+    )?;
+    Ok(device.wgpu().create_texture(&wgpu::TextureDescriptor {
+        label: Some(what),
+        size: wgpu::Extent3d {
+            width: width as u32,
+            height: height as u32,
+            depth_or_array_layers: layers as u32,
+        },
+        mip_level_count: 1,
+        sample_count: 1,
+        dimension: wgpu::TextureDimension::D2,
+        format: wgpu::TextureFormat::Rgba32Float,
+        usage: wgpu::TextureUsages::STORAGE_BINDING
+            | wgpu::TextureUsages::COPY_SRC
+            | wgpu::TextureUsages::COPY_DST,
+        view_formats: &[],
+    }))
+}
+
+/// A texture array of `[columns, rows, layers]` texels that holds `values`, written at the queue's
+/// next submission.
+pub(super) fn constant_texture(
+    device: &Device,
+    what: &str,
+    size: [usize; 3],
+    values: &[f32],
+) -> Result<wgpu::TextureView, GpuError> {
+    let texture = storage_texture(device, what, size)?;
+    device.queue().write_texture(
+        texture.as_image_copy(),
+        bytemuck::cast_slice(values),
+        wgpu::TexelCopyBufferLayout {
+            offset: 0,
+            bytes_per_row: Some((TEXEL * size[0]) as u32),
+            rows_per_image: Some(size[1] as u32),
+        },
+        wgpu::Extent3d {
+            width: size[0] as u32,
+            height: size[1] as u32,
+            depth_or_array_layers: size[2] as u32,
+        },
+    );
+    Ok(layers(&texture, 0, size[2] as u32))
+}
+
+fn layers(texture: &wgpu::Texture, first: u32, count: u32) -> wgpu::TextureView {
+    texture.create_view(&wgpu::TextureViewDescriptor {
+        dimension: Some(wgpu::TextureViewDimension::D2Array),
+        base_array_layer: first,
+        array_layer_count: Some(count),
+        ..Default::default()
+    })
+}
+
 /// A buffer to copy to and map.
 pub(super) fn staging_buffer(device: &Device, size: u64) -> wgpu::Buffer {
     device.wgpu().create_buffer(&wgpu::BufferDescriptor {
@@ -161,8 +479,8 @@ mod tests {
     fn packing_is_undone_by_unpacking() {
         let shape = Shape::new(5, 2, 3);
         let values: Vec<f32> = (0..60).map(|v| v as f32).collect();
-        let packed = pack(&values, shape);
-        assert_eq!(unpack(&packed, shape), values);
+        let packed = pack(&values, shape, 2);
+        assert_eq!(unpack(&packed, shape, 2), values);
         // Negative control: the two layouts differ.
         assert_ne!(packed.get(..60), Some(values.as_slice()));
     }

@@ -1,5 +1,5 @@
-use super::step::Step;
-use super::tensor::{Tensor, blocks};
+use super::step::{Step, Tensors};
+use super::tensor::Tensor;
 use super::{Device, GpuError};
 
 /// Bilinear enlargement by `scale` (`shaders/upsample2d.wgsl`).
@@ -10,18 +10,11 @@ pub(super) fn upsample2d(
     output: &Tensor,
     scale: usize,
 ) -> Result<Step, GpuError> {
-    let planes = input.batch * blocks(input.shape.channels);
-    Step::from_to(
+    Step::by_texel(
         device,
         label,
         ("upsample2d", include_str!("../../shaders/upsample2d.wgsl")),
-        &[
-            ("PLANES", planes as f64),
-            ("IN_HEIGHT", input.shape.height as f64),
-            ("IN_WIDTH", input.shape.width as f64),
-            ("SCALE", scale as f64),
-        ],
-        (input, output),
-        output.texels(),
+        &[("SCALE", scale as f64)],
+        Tensors::from_to(input, output),
     )
 }

@@ -10,7 +10,7 @@
 use std::sync::{Arc, OnceLock};
 
 use whereabot::cascade::Estimate;
-use whereabot::gpu::{AdapterRequest, Device, NetworkPlan, Tensor};
+use whereabot::gpu::{AdapterRequest, Conv2dKernel, Device, Layout, NetworkPlan};
 use whereabot::network::{Layer, Network, Operation, Parameters, Shape};
 use whereabot::reference;
 
@@ -79,12 +79,23 @@ pub fn network(layers: Vec<Layer>, input: Shape, seed: u64) -> Network {
     .unwrap()
 }
 
-/// What the GPU makes of a batch `[image][channel][row][column]`.
+/// What the GPU makes of a batch `[image][channel][row][column]`, in the layout that suits it.
 pub fn on_gpu(network: &Network, batch: usize, values: &[f32]) -> Vec<f32> {
+    on_gpu_by(device().layout(), None, network, batch, values)
+}
+
+/// What the GPU makes of it in `layout`, all convolutions by one `kernel`, if it is given.
+pub fn on_gpu_by(
+    layout: Layout,
+    kernel: Option<Conv2dKernel>,
+    network: &Network,
+    batch: usize,
+    values: &[f32],
+) -> Vec<f32> {
     let device = device();
-    let input = Tensor::new(&device, "input", network.input(), batch).unwrap();
+    let input = NetworkPlan::input(&device, layout, "input", network, batch).unwrap();
     input.write(&device, values).unwrap();
-    let plan = NetworkPlan::new(&device, "test", network, &input).unwrap();
+    let plan = NetworkPlan::with_kernel(&device, "test", network, &input, kernel).unwrap();
     plan.run(&device).unwrap();
     plan.output().read(&device).unwrap()
 }
@@ -135,17 +146,37 @@ pub fn check_layer(operation: Operation, input: Shape, batch: usize, seed: u64, 
     check_network(&one_layer(operation, input, seed), batch, seed, tolerance);
 }
 
-/// Holds the GPU's network to the reference.
+/// Holds the GPU's network to the reference, in every layout.
 pub fn check_network(network: &Network, batch: usize, seed: u64, tolerance: f32) {
+    for layout in Layout::ALL {
+        check_network_by(layout, None, network, batch, seed, tolerance);
+    }
+}
+
+/// Holds the GPU's network to the reference, in buffers: for more channels than a texture has layers.
+pub fn check_in_buffers(network: &Network, seed: u64, tolerance: f32) {
+    check_network_by(Layout::Buffer, None, network, 1, seed, tolerance);
+}
+
+/// Holds the GPU's network to the reference, in `layout`, all convolutions by one `kernel`, if it is
+/// given.
+pub fn check_network_by(
+    layout: Layout,
+    kernel: Option<Conv2dKernel>,
+    network: &Network,
+    batch: usize,
+    seed: u64,
+    tolerance: f32,
+) {
     let input = network.input();
     let values = noise(batch * input.len(), seed + 2);
-    let gpu = on_gpu(network, batch, &values);
+    let gpu = on_gpu_by(layout, kernel, network, batch, &values);
     let expected = on_reference(network, &values);
     let found = difference(&gpu, &expected).unwrap();
     let last = &network.nodes().last().unwrap().layer;
     assert!(
         found <= tolerance,
-        "{last:?} on {input} x {batch}: differs by {found}, allowed {tolerance}"
+        "{last:?} on {input} x {batch} in {layout:?} by {kernel:?}: differs by {found}, allowed {tolerance}"
     );
 }
 

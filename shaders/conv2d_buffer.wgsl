@@ -1,30 +1,28 @@
-// Convolution with stride 1, dilation and zero padding 'same'; bias and activation fused.
+// Convolution with stride 1, dilation and zero padding 'same', from buffer to buffer; bias and
+// activation fused.
 //
-// Activations are [image][channel / 4][row][column] of vec4. An invocation makes COLUMNS pixels of
+// An invocation makes COLUMNS pixels of
 // one row, TILES apart so that neighbouring invocations read neighbouring texels, in eight output
 // channels: two blocks of four.
 
-override IN_BLOCKS: u32;
-override OUT_BLOCKS: u32;
-override HEIGHT: u32;
-override WIDTH: u32;
-override BATCH: u32;
 override KERNEL: u32;
 override DILATION: u32;
 // 0 none, 1 ReLU, 2 sigmoid
 override ACTIVATION: u32;
 
 const COLUMNS = 4u;
+override IN_BLOCKS: u32 = INPUT_PLANES / BATCH;
+override OUT_BLOCKS: u32 = OUTPUT_PLANES / BATCH;
+override HEIGHT: u32 = OUTPUT_HEIGHT;
+override WIDTH: u32 = OUTPUT_WIDTH;
 override TILES: u32 = (WIDTH + COLUMNS - 1u) / COLUMNS;
 override OUT_PAIRS: u32 = (OUT_BLOCKS + 1u) / 2u;
 override INVOCATIONS: u32 = BATCH * OUT_PAIRS * HEIGHT * TILES;
 
-@group(0) @binding(0) var<storage, read> input: array<vec4<f32>>;
 // [out block][kernel row][kernel column][in block], a column of the matrix for each input channel
-@group(0) @binding(1) var<storage, read> weights: array<mat4x4<f32>>;
+@group(0) @binding(3) var<storage, read> weights: array<mat4x4<f32>>;
 // [out block]
-@group(0) @binding(2) var<storage, read> bias: array<vec4<f32>>;
-@group(0) @binding(3) var<storage, read_write> output: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read> bias: array<vec4<f32>>;
 
 fn activate(x: vec4<f32>) -> vec4<f32> {
     if ACTIVATION == 1u {
@@ -73,7 +71,7 @@ fn main(
             for (var i = 0u; i < COLUMNS; i++) {
                 let in_x = i32(tile + i * TILES + kx * DILATION) - reach;
                 inside[i] = in_x >= 0 && in_x < i32(WIDTH);
-                offset[i] = (image * IN_BLOCKS * HEIGHT + u32(in_y)) * WIDTH
+                offset[i] = (image * HEIGHT + u32(in_y)) * WIDTH
                     + u32(clamp(in_x, 0, i32(WIDTH) - 1));
             }
             let tap = (ky * KERNEL + kx) * IN_BLOCKS;
@@ -81,7 +79,7 @@ fn main(
                 let weight_low = weights[first * taps + tap + block];
                 let weight_high = weights[second * taps + tap + block];
                 for (var i = 0u; i < COLUMNS; i++) {
-                    let value = select(vec4(0.0), input[offset[i] + block * HEIGHT * WIDTH], inside[i]);
+                    let value = select(vec4(0.0), input[offset[i] + block * BATCH * HEIGHT * WIDTH], inside[i]);
                     low[i] += weight_low * value;
                     high[i] += weight_high * value;
                 }
@@ -92,10 +90,9 @@ fn main(
     for (var i = 0u; i < COLUMNS; i++) {
         let x = tile + i * TILES;
         if x < WIDTH {
-            let at = ((image * OUT_BLOCKS + first) * HEIGHT + y) * WIDTH + x;
-            output[at] = activate(low[i]);
+            output_set(first * BATCH + image, y, x, activate(low[i]));
             if second != first {
-                output[at + HEIGHT * WIDTH] = activate(high[i]);
+                output_set(second * BATCH + image, y, x, activate(high[i]));
             }
         }
     }

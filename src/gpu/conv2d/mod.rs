@@ -1,0 +1,141 @@
+//! Convolution with stride 1, dilation and zero padding 'same': one file a kernel, which packs the
+//! weights for it. [`super::choice`] says which one serves a layer.
+
+mod buffer;
+mod subgroup_one;
+mod texture;
+
+pub(super) use buffer::buffer;
+pub(super) use subgroup_one::subgroup_one;
+pub(super) use texture::texture;
+
+use super::step::{Step, StepDescriptor, Tensors, Work, activation_number};
+use super::tensor::{Tensor, blocks, constant_buffer, uniform_buffer};
+use super::{Device, GpuError};
+use crate::network::{Activation, Parameters, Shape};
+
+/// A convolution to plan: from `input` to `output`, of the same height, width and layout.
+pub(super) struct Conv2d<'a> {
+    pub label: &'a str,
+    pub input: &'a Tensor,
+    pub output: &'a Tensor,
+    /// In PyTorch's order.
+    pub parameters: &'a Parameters,
+    pub kernel: usize,
+    pub dilation: usize,
+    pub activation: Activation,
+}
+
+impl Conv2d<'_> {
+    /// Pixels that the kernel reaches beyond its centre.
+    pub fn reach(&self) -> usize {
+        self.kernel / 2 * self.dilation
+    }
+
+    /// What the layer has to do, by whatever kernel.
+    fn work(&self) -> Work {
+        let weights = self.parameters.weight.len();
+        let Shape { height, width, .. } = self.output.shape;
+        Work::new(
+            Tensors::from_to(self.input, self.output),
+            weights + self.parameters.bias.len(),
+            self.output.batch * height * width * weights,
+        )
+    }
+
+    /// The weights that `place` gives a place among `len` values of zero, by output channel, input
+    /// channel, kernel row and kernel column.
+    fn packed(&self, len: usize, place: impl Fn([usize; 4]) -> usize) -> Vec<f32> {
+        let mut packed = vec![0.0; len];
+        let (kernel, channels) = (self.kernel, self.input.shape.channels);
+        for (index, weight) in self.parameters.weight.iter().enumerate() {
+            let (tap, row) = (index % (kernel * kernel), index / (kernel * kernel));
+            let at = place([row / channels, row % channels, tap / kernel, tap % kernel]);
+            if let Some(value) = packed.get_mut(at) {
+                *value = *weight;
+            }
+        }
+        packed
+    }
+
+    /// The biases, filled up with zeros to full pairs of blocks.
+    fn padded_bias(&self) -> Vec<f32> {
+        let mut padded = self.parameters.bias.clone();
+        padded.resize(blocks(padded.len()).next_multiple_of(2) * 4, 0.0);
+        padded
+    }
+}
+
+/// The margin that a convolution's input wants in textures. Taps farther away than the image is long
+/// find zeros wherever they look: the margin need not go on to them.
+pub(super) fn margin(input: Shape, kernel: usize, dilation: usize) -> usize {
+    (kernel / 2 * dilation).min(input.height.max(input.width))
+}
+
+/// How many rows an invocation of the kernels for textures makes. They are `dilation` apart: of the
+/// image's rows, few lie on one lattice. A tap's weights cost as much as three rows' arithmetic;
+/// beyond four rows, there is less to gain than the driver's compiler takes.
+fn rows(conv: &Conv2d<'_>) -> usize {
+    let on_lattice = conv.output.shape.height.div_ceil(conv.dilation);
+    let cost = |rows: &usize| on_lattice.div_ceil(*rows) * (3 + rows);
+    (1..=4).min_by_key(cost).unwrap_or(1)
+}
+
+/// A step of a `kernel` for textures, `source` with `shaders/conv2d_lattice.wgsl` in front: its
+/// invocations make `rows` rows, and workgroups make each pixel for `parts` sets of channels.
+fn lattice(
+    device: &Device,
+    conv: &Conv2d<'_>,
+    (kernel, source): (&'static str, &str),
+    weights: &wgpu::TextureView,
+    rows: usize,
+    parts: usize,
+) -> Result<Step, GpuError> {
+    let Conv2d {
+        label,
+        input,
+        output,
+        ..
+    } = *conv;
+    let Shape { height, width, .. } = output.shape;
+    let lattice = conv.dilation.min(height);
+    let row_groups = height.div_ceil(lattice * rows) * lattice;
+    let margin = |tensor: &Tensor| tensor.margin().unwrap_or(0) as u32;
+    let layer = [
+        output.batch as u32,
+        blocks(input.shape.channels) as u32,
+        blocks(output.shape.channels) as u32,
+        height as u32,
+        width as u32,
+        margin(input),
+        margin(output),
+        conv.dilation as u32,
+        lattice as u32,
+        row_groups as u32,
+        activation_number(conv.activation),
+        0,
+    ];
+    let layer = uniform_buffer(device, &format!("{label}: layer"), &layer);
+    let bias = constant_buffer(device, &format!("{label}: bias"), &conv.padded_bias())?;
+    Step::new(
+        device,
+        &StepDescriptor {
+            label,
+            kernel,
+            source,
+            entry_point: "main",
+            tensors: Tensors::default(),
+            constants: &[],
+            sizes: &[("ROWS", rows), ("KERNEL", conv.kernel)],
+            bindings: &[
+                (0, input.resource()),
+                (2, output.resource()),
+                (3, wgpu::BindingResource::TextureView(weights)),
+                (4, bias.as_entire_binding()),
+                (5, layer.as_entire_binding()),
+            ],
+            workgroups: (row_groups * width).div_ceil(64) * output.batch * parts,
+            work: conv.work(),
+        },
+    )
+}
