@@ -97,6 +97,18 @@ def test_views_keep_image_and_mask_together():
     assert 0.1 < masks.mean() < 0.9
 
 
+def test_crops_are_parts_of_the_image_as_they_are():
+    torch.manual_seed(0)
+    numbers = torch.arange(float(INPUT_HEIGHT * INPUT_WIDTH)).reshape(1, 1, INPUT_HEIGHT, INPUT_WIDTH)
+    images, masks = data.random_crops(numbers.expand(8, 3, -1, -1), numbers.expand(8, 1, -1, -1), 20, 30)
+    assert images.shape == (8, 3, 20, 30) and torch.equal(images[:, :1], masks)
+    corners = masks[:, 0, 0, 0]
+    inside = torch.arange(20)[:, None] * INPUT_WIDTH + torch.arange(30)
+    assert torch.equal(masks[:, 0] - corners[:, None, None], inside.expand(8, -1, -1).float())
+    # Not one place for all.
+    assert len(corners.unique()) > 4
+
+
 def test_colours_vary_about_the_image():
     torch.manual_seed(0)
     image = torch.randint(0, 256, (1, 32, 40, 3), dtype=torch.uint8)

@@ -2,12 +2,13 @@ import csv
 import json
 import math
 import shutil
+from types import SimpleNamespace
 
 import pytest
 import torch
 from safetensors.torch import load_file
 
-from whereabot_trainer import data, evaluate, golden
+from whereabot_trainer import data, evaluate, golden, pipeline
 from whereabot_trainer.__main__ import main
 from whereabot_trainer.export import SURE_THRESHOLDS, choose_presence
 from whereabot_trainer.model import read_model
@@ -206,6 +207,21 @@ def test_one_command_trains_two_robots_and_goes_on(recording, tmp_path, capsys):
     assert (tmp_path / "out" / "mask" / "log.csv").read_text() == before
     with pytest.raises(SystemExit, match="is of ur10"):
         main([*command[:2], str(recording), "--validation", str(other), *command[4:]])
+
+
+def test_the_recordings_tell_whether_the_camera_stands_still(recording, tmp_path):
+    def commands(*folders):
+        args = SimpleNamespace(recording=folders, validation=None, family="paper", negatives=None, minutes=1.0, seed=1,
+                               cache="c", dtype="f16", out=str(tmp_path / "out"))
+        return [words for words in pipeline.steps(args) if words[0] != "export"]
+
+    fixed = tmp_path / "fixed"
+    fixed.mkdir()
+    header = json.loads((recording / "recording.json").read_text())
+    (fixed / "recording.json").write_text(json.dumps(header | {"source": {"protocol": "fixed_camera"}}))
+    assert all("fixed" in words[words.index("--camera") + 1] for words in commands(fixed))
+    # One camera that moves is enough.
+    assert all("--camera" not in words for words in commands(fixed, recording))
 
 
 def test_a_start_from_other_weights_is_the_same_function():

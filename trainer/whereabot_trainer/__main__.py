@@ -23,13 +23,17 @@ def _training_flags(parser, *, minutes, batch, learning_rate, momentum, dilation
                         help="train for so long, resumed parts included; rates follow the clock (%(default)s)")
     length.add_argument("--iterations", type=int, metavar="N", help="train for N batches instead: reproducible")
     parser.add_argument("--batch", type=int, default=batch, metavar="N", help="samples a batch (%(default)s)")
+    parser.add_argument("--camera", choices=("free", "fixed"), default="free",
+                        help="free: show other views too (mask: zoomed, tilted, mirrored; joints: a turned camera, parts"
+                        " hidden); fixed: the recordings' camera stays where it is (%(default)s)")
     parser.add_argument("--dilations", type=_integers, default=dilations, metavar="D,D,...",
                         help="dilation of each convolution (%(default)s)")
-    parser.add_argument("--optimizer", choices=("adamw", "sgd"), default="adamw", help="(%(default)s)")
+    parser.add_argument("--optimizer", choices=("muon", "adamw", "sgd"), default="muon",
+                        help="muon: for the hidden convolutions, AdamW for the rest (%(default)s)")
     parser.add_argument("--learning-rate", nargs=2, type=float, default=learning_rate, metavar=("START", "END"),
                         help="cosine from START to END (%(default)s)")
     parser.add_argument("--momentum", nargs=2, type=float, default=momentum, metavar=("START", "END"),
-                        help="momentum of SGD or beta1 of AdamW, growing linearly (%(default)s)")
+                        help="momentum of Muon and SGD, and beta1 of AdamW, growing linearly (%(default)s)")
     parser.add_argument("--weight-decay", type=float, default=1e-4, metavar="W", help="(%(default)s)")
     parser.add_argument("--clip-gradient", type=float, default=5.0, metavar="NORM", help="(%(default)s)")
     parser.add_argument("--normalise", action=argparse.BooleanOptionalAction, default=True,
@@ -86,7 +90,7 @@ def main(argv=None):
     command.set_defaults(run=lambda args: pipeline.run(args, main))
 
     command = commands.add_parser("train-mask", help="train the mask network")
-    _training_flags(command, minutes=40, batch=8, learning_rate=(4e-3, 2e-5), momentum=(0.9, 0.9),
+    _training_flags(command, minutes=40, batch=8, learning_rate=(4e-3, 2e-5), momentum=(0.95, 0.95),
                     dilations=(1, 2, 4, 8, 1))
     command.add_argument("--family", choices=("paper", "context"), default="paper",
                          help="the paper's network, or a wider one with skips that has no --dilations (%(default)s)")
@@ -101,7 +105,7 @@ def main(argv=None):
     command.set_defaults(run=_run(train.train_mask))
 
     command = commands.add_parser("train-joint", help="train the joint network")
-    _training_flags(command, minutes=35, batch=16, learning_rate=(2e-3, 2e-5), momentum=(0.9, 0.95), dilations=(1, 2, 4))
+    _training_flags(command, minutes=35, batch=16, learning_rate=(2e-3, 2e-5), momentum=(0.95, 0.95), dilations=(1, 2, 4))
     command.add_argument("--family", choices=("paper", "context"), default="paper",
                          help="the paper's network, or heat maps with votes, without --dilations and --pool (%(default)s)")
     command.add_argument("--heat-weight", type=float, default=0.02, metavar="W",

@@ -293,6 +293,17 @@ def random_views(images, masks, height, width, tilt_degrees=10, zoom=(0.7, 1.6))
     return both[:, :3], (both[:, 3:] >= 0.5).float()
 
 
+def random_crops(images, masks, height, width):
+    """Random parts of height x width, at the size they have: what a camera that stands still will see again."""
+    parts = []
+    for picture in torch.cat([images, masks], 1):
+        y = int(torch.randint(0, picture.shape[1] - height + 1, (), device="cpu"))
+        x = int(torch.randint(0, picture.shape[2] - width + 1, (), device="cpu"))
+        parts.append(picture[:, y : y + height, x : x + width])
+    both = torch.stack(parts)
+    return both[:, :3], both[:, 3:]
+
+
 def random_rotations(count, pan_tilt_degrees=8, roll_degrees=10):
     """Small camera rotations [N, 3, 3]."""
     tilt, pan = (torch.deg2rad(_uniform(count, -pan_tilt_degrees, pan_tilt_degrees)) for _ in range(2))

@@ -15,9 +15,12 @@ MASK, COMMON = 0.45, 0.6
 
 def steps(args):
     """The commands, as lists of words, for recordings of one robot or of several."""
-    by_robot = {}
+    by_robot, fixed = {}, True
     for folder in args.recording:
-        by_robot.setdefault(data.read_header(folder)["robot"], ([], []))[0].append(folder)
+        header = data.read_header(folder)
+        by_robot.setdefault(header["robot"], ([], []))[0].append(folder)
+        fixed &= header.get("source", {}).get("protocol") == "fixed_camera"
+    camera = ["--camera", "fixed"] if fixed else []
     for folder in args.validation or []:
         robot = data.read_header(folder)["robot"]
         if robot not in by_robot:
@@ -33,7 +36,7 @@ def steps(args):
     def step(command, run, robots, minutes, *flags):
         resume = ["--resume"] if (out / run / "last.pt").exists() else []
         commands.append([command, "--family", args.family, *recordings(robots), "--out", str(out / run), "--minutes",
-                         f"{minutes:.4g}", "--cache", args.cache, "--seed", str(args.seed), *flags, *resume])
+                         f"{minutes:.4g}", "--cache", args.cache, "--seed", str(args.seed), *camera, *flags, *resume])
 
     def joint(run, mask, robots, minutes, *flags):
         step("train-joint", run, robots, minutes, "--mask-run", str(out / mask), "--estimated-masks", "0.5", *flags)
@@ -41,8 +44,7 @@ def steps(args):
     if args.family == "context":
         views = ["--crop", "224", "184", "--zoom", "0.4", "2.0"]
     else:
-        # Test images show what the training cameras see: there is little to gain from other sizes.
-        views = ["--crop", "192", "160", "--zoom", "0.85", "1.2"]
+        views = ["--crop", "192", "160"]
     if args.negatives:
         views += ["--negatives", *args.negatives]
     robots = list(by_robot)

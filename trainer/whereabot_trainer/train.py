@@ -34,7 +34,7 @@ class Schedule:
         rate *= min(1, (progress + 1e-3) / self.WARM_UP)
         momentum = self.momentum[0] + (self.momentum[1] - self.momentum[0]) * progress
         for group in optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = rate * group.get("scale", 1)
             if "betas" in group:
                 group["betas"] = (momentum, group["betas"][1])
             else:
@@ -42,10 +42,56 @@ class Schedule:
         return rate
 
 
-def make_optimizer(name, parameters, weight_decay):
+class Muon:
+    """Muon for the hidden convolutions, AdamW for everything else (Jordan et al., 2024): what Muon adds to a kernel,
+    as a matrix [out, all inputs], has equal singular values, so that rare directions are learnt as soon as common ones.
+    """
+
+    # Muon's updates are as large as AdamW's at the same rate; it bears larger ones.
+    SCALE = 2
+
+    def __init__(self, network, weight_decay):
+        hidden = [layer["name"] for layer in network.layers if layer.get("activation") == "relu" and layer["op"] == "conv2d"]
+        self.kernels = [getattr(network, name).weight for name in hidden[1:]]
+        taken = {id(kernel) for kernel in self.kernels}
+        self.others = torch.optim.AdamW((p for p in network.parameters() if id(p) not in taken), lr=0.0, betas=(0.9, 0.99),
+                                        weight_decay=weight_decay)
+        # The same memory as the kernels.
+        self.matrices = [torch.nn.Parameter(self._matrix(kernel.data)) for kernel in self.kernels]
+        self.muon = torch.optim.Muon(self.matrices, lr=0.0, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw")
+        self.muon.param_groups[0]["scale"] = self.SCALE
+        self.param_groups = self.others.param_groups + self.muon.param_groups
+
+    @staticmethod
+    def _matrix(kernel):
+        return kernel.permute(0, 2, 3, 1).view(len(kernel), -1)
+
+    def zero_grad(self, set_to_none=True):
+        self.others.zero_grad(set_to_none)
+        for kernel in self.kernels:
+            kernel.grad = None
+
+    def step(self):
+        for matrix, kernel in zip(self.matrices, self.kernels, strict=True):
+            matrix.grad = kernel.grad.permute(0, 2, 3, 1).reshape(matrix.shape)
+        self.others.step()
+        self.muon.step()
+
+    def state_dict(self):
+        return {"others": self.others.state_dict(), "muon": self.muon.state_dict()}
+
+    def load_state_dict(self, state):
+        self.others.load_state_dict(state["others"])
+        self.muon.load_state_dict(state["muon"])
+        self.param_groups = self.others.param_groups + self.muon.param_groups
+
+
+def make_optimizer(name, network, weight_decay):
     if name == "sgd":
-        return torch.optim.SGD(parameters, lr=0.0, momentum=0.9, weight_decay=weight_decay)
-    return torch.optim.AdamW(parameters, lr=0.0, betas=(0.9, 0.99), weight_decay=weight_decay)
+        return torch.optim.SGD(network.parameters(), lr=0.0, momentum=0.9, weight_decay=weight_decay)
+    if name == "adamw":
+        return torch.optim.AdamW(network.parameters(), lr=0.0, betas=(0.9, 0.99), weight_decay=weight_decay)
+    return Muon(network, weight_decay)
 
 
 class Order:
@@ -80,7 +126,7 @@ def fit(args, network, numbers, draw, batch_loss, score, card):
     out = Path(args.out)
     out.mkdir(parents=True, exist_ok=True)
     (out / "settings.json").write_text(json.dumps(vars(args), indent=1, default=str) + "\n")
-    optimizer = make_optimizer(args.optimizer, network.parameters(), args.weight_decay)
+    optimizer = make_optimizer(args.optimizer, network, args.weight_decay)
     schedule = Schedule(args.learning_rate, args.momentum)
     order = Order(numbers, args.batch)
     iteration, before = 0, 0.0
@@ -230,7 +276,7 @@ def train_mask(args):
     w_fg, w_bg = losses.class_weights(share)
     height, width = args.crop[1], args.crop[0]
     card |= {"family": args.family, "foreground_share": share, "w_fg": w_fg, "w_bg": w_bg,
-             "crop": args.crop, "zoom": args.zoom}
+             "crop": args.crop, "camera": args.camera, **({"zoom": args.zoom} if args.camera == "free" else {})}
     layers = context_mask_layers() if args.family == "context" else paper_mask_layers(args.dilations)
     network = initialise(Network(layers, MASK_INPUT, normalise=args.normalise))
     if args.init_from:
@@ -249,6 +295,8 @@ def train_mask(args):
             drawn = torch.randint(len(negatives), (int(rows.sum()),), device="cpu")
             images[rows], masks[rows] = torch.from_numpy(negatives[drawn.numpy()]), 0.0
         images, masks = data.jitter_colours(images.to(args.device)), masks.to(args.device)
+        if args.camera == "fixed":
+            return data.random_crops(images, masks, height, width)
         return data.random_views(images, masks, height, width, zoom=args.zoom)
 
     def batch_loss(images, masks):
@@ -373,7 +421,7 @@ def train_joint(args):
         unit, layers = ArmLengths(), heatmap_joint_layers()
     else:
         unit, layers = Standardised.of(samples.joints[numbers]), paper_joint_layers(args.dilations, args.pool)
-    card |= {"family": args.family, "samples": len(numbers), "overlay": rule, "min_coverage": args.min_coverage,
+    card |= {"family": args.family, "samples": len(numbers), "camera": args.camera, "overlay": rule, "min_coverage": args.min_coverage,
              "estimated_masks": args.estimated_masks, "estimated_after": args.estimated_after, **unit.card()}
     network = initialise(Network(layers, JOINT_INPUT, normalise=args.normalise))
     if args.family == "context":
@@ -404,9 +452,10 @@ def train_joint(args):
             for row in torch.nonzero(torch.rand(len(batch), device="cpu") < args.estimated_masks).flatten():
                 masks[row, 0] = torch.from_numpy(estimated[int(batch[row])]).float() / 255
         images, masks = data.jitter_colours(images.to(args.device)), masks.to(args.device)
-        overlays = data.erase_rectangles(overlay(images, masks, rule))
-        overlays, truth = data.rotate_camera(
-            overlays, joints[batch].to(args.device), data.random_rotations(len(batch)))
+        overlays, truth = overlay(images, masks, rule), joints[batch].to(args.device)
+        if args.camera == "free":
+            overlays, truth = data.rotate_camera(
+                data.erase_rectangles(overlays), truth, data.random_rotations(len(batch)))
         return overlays, (truth, arms[batch].to(args.device))
 
     def batch_loss(overlays, joints_and_arms):
