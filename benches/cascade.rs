@@ -5,13 +5,15 @@
 use std::hint::black_box;
 use std::path::Path;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use image::RgbaImage;
-use whereabot::camera::Camera;
+use whereabot::camera::{Camera, Rectification};
 use whereabot::cascade::{Locator, Output};
-use whereabot::gpu::{AdapterRequest, Device};
+use whereabot::gpu::{AdapterRequest, Device, Plan};
 use whereabot::network::Model;
+use whereabot::reference;
 
 fn cascade(criterion: &mut Criterion) {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
@@ -45,6 +47,33 @@ fn cascade(criterion: &mut Criterion) {
     group.bench_function("load the model", |b| b.iter(|| Model::load(&file).unwrap()));
     group.bench_function("plan it", |b| {
         b.iter(|| Locator::on_gpu(Arc::clone(&device), &model).unwrap());
+    });
+    group.finish();
+
+    let mut group = criterion.benchmark_group("on the CPU");
+    group.sample_size(10);
+    let input = model.description.input;
+    let to = &model.description.camera;
+    let rectification = Rectification::new(&camera, to, input.width, input.height);
+    let (rows, columns) = (input.height as usize, input.width as usize);
+    group.bench_function("rectify, reference", |b| {
+        b.iter(|| reference::rectify(black_box(&image), &rectification, rows, columns));
+    });
+    let mut plan = Plan::new(&device, &model, 1).unwrap();
+    plan.write(&device, 0, &image, &rectification).unwrap();
+    group.bench_function("encode and submit", |b| {
+        b.iter_custom(|frames| {
+            let mut total = Duration::ZERO;
+            for _ in 0..frames {
+                let clock = Instant::now();
+                let mut encoder = device.wgpu().create_command_encoder(&Default::default());
+                plan.encode(&mut encoder, true, false, None);
+                device.queue().submit([encoder.finish()]);
+                total += clock.elapsed();
+                device.wait().unwrap();
+            }
+            total
+        });
     });
     group.finish();
 }

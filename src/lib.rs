@@ -1,6 +1,7 @@
 //! Finds a robot arm in one colour image from a freely moving camera: which pixels are the robot,
 //! and where its joints are, in metres, in the camera's optical frame (REP 103).
 
+pub mod benchmark;
 pub mod camera;
 pub mod cascade;
 #[cfg(feature = "cli")]

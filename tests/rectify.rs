@@ -26,7 +26,8 @@ fn on_gpu(image: &RgbaImage, params: &Rectification, width: usize, height: usize
     let mut rectify = device.scoped(|| Rectify::new(&device, &output)).unwrap();
     rectify.write(&device, &output, image, params).unwrap();
     let mut encoder = device.wgpu().create_command_encoder(&Default::default());
-    rectify.encode(&mut encoder.begin_compute_pass(&Default::default()));
+    let step = rectify.step();
+    step.encode(&mut encoder.begin_compute_pass(&Default::default()));
     device.queue().submit([encoder.finish()]);
     output.read(&device).unwrap()
 }

@@ -9,7 +9,7 @@ use naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
 use naga::{Module, ShaderStage};
 
 /// One for each file in `shaders/`: a kernel that nobody lists is not tested.
-const KERNELS: [&str; 12] = [
+const KERNELS: [&str; 14] = [
     "back_project",
     "concat",
     "conv2d",
@@ -17,6 +17,8 @@ const KERNELS: [&str; 12] = [
     "dense",
     "max_pool2d",
     "overlay",
+    "probe_arithmetic",
+    "probe_copy",
     "rectify",
     "render",
     "sigmoid",

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use serde_json::json;
 
-use crate::gpu::{AdapterReport, AdapterRequest, Choice, GpuError, list_adapters};
+use crate::gpu::{self, AdapterReport, AdapterRequest, Choice, GpuError, list_adapters};
 
 /// List the graphics adapters, and say which one `locate` would use and why
 ///
@@ -40,9 +40,9 @@ fn as_json(reports: &[AdapterReport], choice: &Result<Choice, GpuError>) -> serd
             let mut adapter = json!({
                 "index": index,
                 "name": report.info.name,
-                "type": device_type(report),
+                "type": gpu::device_type(&report.info),
                 "backend": report.info.backend.to_str(),
-                "driver": driver(report),
+                "driver": gpu::driver(&report.info),
                 "tier": report.tier.to_string(),
                 "usable": report.unusable.is_none(),
             });
@@ -67,9 +67,9 @@ fn as_table(reports: &[AdapterReport], choice: &Result<Choice, GpuError>) -> Str
         [
             index.to_string(),
             report.info.name.clone(),
-            device_type(report).to_owned(),
+            gpu::device_type(&report.info).to_owned(),
             report.info.backend.to_str().to_owned(),
-            driver(report),
+            gpu::driver(&report.info),
             report.tier.to_string(),
             report
                 .unusable
@@ -101,20 +101,4 @@ fn as_table(reports: &[AdapterReport], choice: &Result<Choice, GpuError>) -> Str
         Err(_) => "\nused: none\n".to_owned(),
     };
     text
-}
-
-fn device_type(report: &AdapterReport) -> &'static str {
-    match report.info.device_type {
-        wgpu::DeviceType::DiscreteGpu => "discrete GPU",
-        wgpu::DeviceType::IntegratedGpu => "integrated GPU",
-        wgpu::DeviceType::VirtualGpu => "virtual GPU",
-        wgpu::DeviceType::Cpu => "CPU",
-        wgpu::DeviceType::Other => "other",
-    }
-}
-
-fn driver(report: &AdapterReport) -> String {
-    format!("{} {}", report.info.driver, report.info.driver_info)
-        .trim()
-        .to_owned()
 }

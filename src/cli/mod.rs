@@ -1,6 +1,7 @@
 //! The command line: one file a command.
 
 mod adapters;
+mod bench;
 mod evaluate;
 mod info;
 mod locate;
@@ -22,6 +23,7 @@ enum Command {
     Locate(locate::Args),
     Adapters(adapters::Args),
     Info(info::Args),
+    Bench(bench::Args),
     Record(record::Args),
     Evaluate(evaluate::Args),
     #[command(subcommand)]
@@ -41,6 +43,7 @@ pub fn main() -> ExitCode {
         Command::Locate(args) => locate::run(args),
         Command::Adapters(args) => adapters::run(&args),
         Command::Info(args) => info::run(&args),
+        Command::Bench(args) => bench::run(&args),
         Command::Record(args) => record::run(args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Recording(args) => recording::run(&args),

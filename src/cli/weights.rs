@@ -12,15 +12,8 @@ const DEFAULT_ROBOT: &str = "ur5";
 /// Loads `file`, or else the model of `robot` from the first place that has one. With both, the file
 /// must be a model of that robot.
 pub fn load(robot: Option<&str>, file: Option<&Path>) -> anyhow::Result<Model> {
-    let found;
-    let file = match file {
-        Some(file) => file,
-        None => {
-            found = find(robot.unwrap_or(DEFAULT_ROBOT))?;
-            &found
-        }
-    };
-    let model = Model::load(file)?;
+    let file = path(robot, file)?;
+    let model = Model::load(&file)?;
     let trained_for = &model.description.robot;
     if let Some(robot) = robot
         && robot != trained_for
@@ -31,6 +24,14 @@ pub fn load(robot: Option<&str>, file: Option<&Path>) -> anyhow::Result<Model> {
         );
     }
     Ok(model)
+}
+
+/// `file`, or else where the model of `robot` is.
+pub fn path(robot: Option<&str>, file: Option<&Path>) -> anyhow::Result<PathBuf> {
+    match file {
+        Some(file) => Ok(file.to_owned()),
+        None => find(robot.unwrap_or(DEFAULT_ROBOT)),
+    }
 }
 
 /// A robot's name, which becomes a file's name.

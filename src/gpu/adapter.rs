@@ -185,7 +185,7 @@ fn choose(reports: &[AdapterReport], request: &AdapterRequest) -> Result<Choice,
                 reason: format!(
                     "best of {} found: {}",
                     reports.len(),
-                    device_type(report.info.device_type)
+                    as_reason(report.info.device_type)
                 ),
             })
             .ok_or_else(|| GpuError::NoAdapter {
@@ -219,6 +219,24 @@ fn choose(reports: &[AdapterReport], request: &AdapterRequest) -> Result<Choice,
     }
 }
 
+/// What kind of device an adapter is, such as `discrete GPU`.
+pub fn device_type(info: &AdapterInfo) -> &'static str {
+    match info.device_type {
+        DeviceType::DiscreteGpu => "discrete GPU",
+        DeviceType::IntegratedGpu => "integrated GPU",
+        DeviceType::VirtualGpu => "virtual GPU",
+        DeviceType::Cpu => "CPU",
+        DeviceType::Other => "other",
+    }
+}
+
+/// The driver's name and version.
+pub fn driver(info: &AdapterInfo) -> String {
+    format!("{} {}", info.driver, info.driver_info)
+        .trim()
+        .to_owned()
+}
+
 /// Real GPUs first, and native backends before GL.
 fn rank(info: &AdapterInfo) -> (u8, u8) {
     let kind = match info.device_type {
@@ -236,7 +254,7 @@ fn rank(info: &AdapterInfo) -> (u8, u8) {
     (kind, backend)
 }
 
-fn device_type(kind: DeviceType) -> &'static str {
+fn as_reason(kind: DeviceType) -> &'static str {
     match kind {
         DeviceType::DiscreteGpu => "a discrete GPU",
         DeviceType::IntegratedGpu => "an integrated GPU",

@@ -13,7 +13,10 @@ pub(super) fn back_project(
     Step::from_to(
         device,
         label,
-        include_str!("../../shaders/back_project.wgsl"),
+        (
+            "back_project",
+            include_str!("../../shaders/back_project.wgsl"),
+        ),
         &[("JOINTS", joints as f64), ("BATCH", input.batch as f64)],
         (input, output),
         input.batch * joints,

@@ -1,4 +1,4 @@
-use super::step::Step;
+use super::step::{Step, StepDescriptor, Work};
 use super::tensor::{Tensor, blocks};
 use super::{Device, GpuError};
 
@@ -15,19 +15,31 @@ pub(super) fn concat(
         .iter()
         .map(|&input| {
             let channels = input.shape.channels;
-            let step = Step::from_to(
+            let invocations = input.batch * (first % 4 + channels).div_ceil(4) * plane;
+            let step = Step::new(
                 device,
-                label,
-                include_str!("../../shaders/concat.wgsl"),
-                &[
-                    ("PLANE", plane as f64),
-                    ("BATCH", input.batch as f64),
-                    ("CHANNELS", channels as f64),
-                    ("FIRST", first as f64),
-                    ("OUT_BLOCKS", blocks(output.shape.channels) as f64),
-                ],
-                (input, output),
-                input.batch * (first % 4 + channels).div_ceil(4) * plane,
+                &StepDescriptor {
+                    label,
+                    kernel: "concat",
+                    source: include_str!("../../shaders/concat.wgsl"),
+                    entry_point: "main",
+                    constants: &[
+                        ("PLANE", plane as f64),
+                        ("BATCH", input.batch as f64),
+                        ("CHANNELS", channels as f64),
+                        ("FIRST", first as f64),
+                        ("OUT_BLOCKS", blocks(output.shape.channels) as f64),
+                    ],
+                    bindings: &[
+                        (0, input.buffer.as_entire_binding()),
+                        (1, output.buffer.as_entire_binding()),
+                    ],
+                    workgroups: invocations.div_ceil(64),
+                    work: Work {
+                        operations: 0,
+                        bytes: 2 * input.bytes(),
+                    },
+                },
             );
             first += channels;
             step

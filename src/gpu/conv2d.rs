@@ -1,4 +1,4 @@
-use super::step::{Step, StepDescriptor, activation_constant};
+use super::step::{Step, StepDescriptor, Work, activation_constant};
 use super::tensor::{Tensor, blocks, constant_buffer};
 use super::{Device, GpuError};
 use crate::network::{Activation, Parameters};
@@ -25,6 +25,7 @@ pub(super) fn conv2d(
         device,
         &StepDescriptor {
             label,
+            kernel: "conv2d",
             source: include_str!("../../shaders/conv2d.wgsl"),
             entry_point: "main",
             constants: &[
@@ -44,6 +45,12 @@ pub(super) fn conv2d(
                 (3, output.buffer.as_entire_binding()),
             ],
             workgroups: invocations.div_ceil(64),
+            work: Work::new(
+                &[input],
+                parameters.weight.len() + parameters.bias.len(),
+                height * width * parameters.weight.len(),
+                output,
+            ),
         },
     )
 }

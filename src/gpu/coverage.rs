@@ -1,6 +1,6 @@
 use bytemuck::{Pod, Zeroable};
 
-use super::step::{Step, StepDescriptor};
+use super::step::{Step, StepDescriptor, Work};
 use super::tensor::Tensor;
 use super::{Device, GpuError};
 use crate::network::Coverage;
@@ -53,6 +53,7 @@ pub fn coverage(
         device,
         &StepDescriptor {
             label: "coverage",
+            kernel: "coverage",
             source: include_str!("../../shaders/coverage.wgsl"),
             entry_point: "main",
             constants: &[
@@ -67,6 +68,10 @@ pub fn coverage(
                 (1, totals.as_entire_binding()),
             ],
             workgroups: mask.batch * (height * width).div_ceil(256),
+            work: Work {
+                operations: 0,
+                bytes: mask.bytes() + totals.size(),
+            },
         },
     )
 }

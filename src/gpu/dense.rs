@@ -1,4 +1,4 @@
-use super::step::{Step, StepDescriptor, activation_constant};
+use super::step::{Step, StepDescriptor, Work, activation_constant};
 use super::tensor::{Tensor, constant_buffer, pack, storage_buffer};
 use super::{Device, GpuError};
 use crate::network::{Activation, Parameters};
@@ -35,6 +35,7 @@ pub(super) fn dense(
         device,
         &StepDescriptor {
             label,
+            kernel: "dense",
             source,
             entry_point: "partial",
             constants,
@@ -44,12 +45,17 @@ pub(super) fn dense(
                 (2, partials.as_entire_binding()),
             ],
             workgroups: sums,
+            work: Work {
+                operations: 2 * (input.batch * parameters.weight.len()) as u64,
+                bytes: input.bytes() + 4 * (parameters.weight.len() + sums) as u64,
+            },
         },
     )?;
     let finish = Step::new(
         device,
         &StepDescriptor {
             label,
+            kernel: "dense",
             source,
             entry_point: "finish",
             constants,
@@ -59,6 +65,10 @@ pub(super) fn dense(
                 (4, output.buffer.as_entire_binding()),
             ],
             workgroups: (input.batch * outputs).div_ceil(64),
+            work: Work {
+                operations: 0,
+                bytes: output.bytes() + 4 * (sums + parameters.bias.len()) as u64,
+            },
         },
     )?;
     Ok([partial, finish])

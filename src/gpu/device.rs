@@ -34,6 +34,9 @@ impl Device {
     /// every kernel, which takes seconds.
     pub const TIMEOUT: Duration = Duration::from_secs(60);
 
+    /// What is asked for where the adapter has it.
+    const FEATURES: wgpu::Features = wgpu::Features::TIMESTAMP_QUERY;
+
     /// Opens the adapter that `request` leads to.
     ///
     /// # Errors
@@ -43,6 +46,7 @@ impl Device {
         let info = adapter.get_info();
         let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("whereabot"),
+            required_features: adapter.features() & Self::FEATURES,
             required_limits: adapter.limits(),
             ..Default::default()
         }))

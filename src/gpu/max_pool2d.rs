@@ -14,7 +14,7 @@ pub(super) fn max_pool2d(
     Step::from_to(
         device,
         label,
-        include_str!("../../shaders/max_pool2d.wgsl"),
+        ("max_pool2d", include_str!("../../shaders/max_pool2d.wgsl")),
         &[
             ("PLANES", planes as f64),
             ("IN_HEIGHT", input.shape.height as f64),

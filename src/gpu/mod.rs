@@ -12,6 +12,7 @@ mod max_pool2d;
 mod network;
 mod overlay;
 mod plan;
+mod probe;
 mod rectify;
 mod sigmoid;
 mod soft_argmax2d;
@@ -20,14 +21,17 @@ mod tensor;
 mod tier;
 mod upsample2d;
 
-pub use adapter::{AdapterReport, AdapterRequest, Choice, Wanted, list_adapters};
+pub use adapter::{
+    AdapterReport, AdapterRequest, Choice, Wanted, device_type, driver, list_adapters,
+};
 pub use coverage::{Totals, coverage};
 pub use device::Device;
 pub use error::GpuError;
 pub use network::NetworkPlan;
 pub use overlay::overlay;
 pub use plan::{Frame, Plan};
+pub use probe::{ArithmeticProbe, copy_probe};
 pub use rectify::Rectify;
-pub use step::Step;
+pub use step::{Step, Work};
 pub use tensor::Tensor;
 pub use tier::Tier;

@@ -120,6 +120,11 @@ impl NetworkPlan {
         self.hidden.iter().chain([&self.output])
     }
 
+    /// The dispatches of all layers, in order.
+    pub fn steps(&self) -> &[Step] {
+        &self.steps
+    }
+
     /// Records all layers.
     pub fn encode(&self, pass: &mut wgpu::ComputePass<'_>) {
         for step in &self.steps {

@@ -1,4 +1,4 @@
-use super::step::{Step, StepDescriptor};
+use super::step::{Step, StepDescriptor, Work};
 use super::tensor::Tensor;
 use super::{Device, GpuError};
 use crate::network::Overlay;
@@ -23,6 +23,7 @@ pub fn overlay(
         device,
         &StepDescriptor {
             label: "overlay",
+            kernel: "overlay",
             source: include_str!("../../shaders/overlay.wgsl"),
             entry_point: "main",
             constants: &[
@@ -36,6 +37,7 @@ pub fn overlay(
                 (2, output.buffer.as_entire_binding()),
             ],
             workgroups: mask.texels().div_ceil(64),
+            work: Work::new(&[image, mask], 0, 0, output),
         },
     )
 }

@@ -104,6 +104,17 @@ impl Plan {
         slot.write(device, &self.image, source, &params)
     }
 
+    /// The dispatches of a frame, in order; those of the joint network only `with_joints`.
+    pub fn steps(&self, with_joints: bool) -> impl Iterator<Item = &Step> {
+        let joints = [&self.overlay].into_iter().chain(self.joint.steps());
+        self.rectify
+            .iter()
+            .map(Rectify::step)
+            .chain(self.mask.steps())
+            .chain([&self.coverage])
+            .chain(joints.take(if with_joints { usize::MAX } else { 0 }))
+    }
+
     /// Runs a frame and waits for it: the result of each image of the batch. The masks are read back
     /// only `with_mask`, the joint network runs only `with_joints`.
     ///
@@ -116,16 +127,26 @@ impl Plan {
         with_mask: bool,
     ) -> Result<Vec<Frame>, GpuError> {
         let mut encoder = device.wgpu().create_command_encoder(&Default::default());
+        self.encode(&mut encoder, with_joints, with_mask, None);
+        device.queue().submit([encoder.finish()]);
+        self.read(device, with_joints, with_mask)
+    }
+
+    /// Records a frame: one compute pass, which writes `timestamps`, and the copies of its results.
+    pub fn encode(
+        &self,
+        encoder: &mut wgpu::CommandEncoder,
+        with_joints: bool,
+        with_mask: bool,
+        timestamps: Option<wgpu::ComputePassTimestampWrites<'_>>,
+    ) {
         encoder.clear_buffer(&self.totals, 0, None);
-        let mut pass = encoder.begin_compute_pass(&Default::default());
-        for rectify in &self.rectify {
-            rectify.encode(&mut pass);
-        }
-        self.mask.encode(&mut pass);
-        self.coverage.encode(&mut pass);
-        if with_joints {
-            self.overlay.encode(&mut pass);
-            self.joint.encode(&mut pass);
+        let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
+            label: None,
+            timestamp_writes: timestamps,
+        });
+        for step in self.steps(with_joints) {
+            step.encode(&mut pass);
         }
         drop(pass);
         let joints = &self.joint.output().buffer;
@@ -138,8 +159,19 @@ impl Plan {
         if with_mask {
             encoder.copy_buffer_to_buffer(masks, 0, &self.masks, 0, masks.size());
         }
-        device.queue().submit([encoder.finish()]);
+    }
 
+    /// Waits for a frame that was submitted as [`Plan::encode`] recorded it: the result of each image.
+    ///
+    /// # Errors
+    /// As [`Device::wait`].
+    pub fn read(
+        &self,
+        device: &Device,
+        with_joints: bool,
+        with_mask: bool,
+    ) -> Result<Vec<Frame>, GpuError> {
+        let totals = self.totals.size();
         let shape = self.image.shape;
         let (width, height) = (shape.width as u32, shape.height as u32);
         let mut frames = device.read(&self.results, |bytes| {
@@ -185,7 +217,7 @@ impl Plan {
         let mut encoder = device.wgpu().create_command_encoder(&Default::default());
         let mut pass = encoder.begin_compute_pass(&Default::default());
         for rectify in &self.rectify {
-            rectify.encode(&mut pass);
+            rectify.step().encode(&mut pass);
         }
         self.overlay.encode(&mut pass);
         self.joint.encode(&mut pass);

@@ -1,6 +1,6 @@
 use image::RgbaImage;
 
-use super::step::{Step, StepDescriptor};
+use super::step::{Step, StepDescriptor, Work};
 use super::tensor::Tensor;
 use super::{Device, GpuError};
 use crate::camera::Rectification;
@@ -33,11 +33,13 @@ impl Rectify {
             device,
             &StepDescriptor {
                 label: "rectify",
+                kernel: "rectify",
                 source: include_str!("../../shaders/rectify.wgsl"),
                 entry_point: "main",
                 constants: &[("WIDTH", width as f64), ("HEIGHT", height as f64)],
                 bindings: &bindings(&view, &params, output),
                 workgroups: (height * width).div_ceil(64),
+                work: work(&texture, output),
             },
         )?;
         Ok(Self {
@@ -62,8 +64,11 @@ impl Rectify {
         if (width, height) != (self.texture.width(), self.texture.height()) {
             self.texture = device.scoped(|| texture(device, width, height))?;
             let view = self.texture.create_view(&Default::default());
-            self.step
-                .rebind(device, &bindings(&view, &self.params, output));
+            self.step.rebind(
+                device,
+                &bindings(&view, &self.params, output),
+                work(&self.texture, output),
+            );
         }
         device.queue().write_texture(
             self.texture.as_image_copy(),
@@ -81,9 +86,18 @@ impl Rectify {
         Ok(())
     }
 
-    /// Records the dispatch.
-    pub fn encode(&self, pass: &mut wgpu::ComputePass<'_>) {
-        self.step.encode(pass);
+    /// The dispatch.
+    pub fn step(&self) -> &Step {
+        &self.step
+    }
+}
+
+/// Reads the source once, writes one image of `output`.
+fn work(source: &wgpu::Texture, output: &Tensor) -> Work {
+    Work {
+        operations: 0,
+        bytes: 4 * u64::from(source.width()) * u64::from(source.height())
+            + 4 * output.shape.len() as u64,
     }
 }
 

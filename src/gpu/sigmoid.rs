@@ -12,7 +12,7 @@ pub(super) fn sigmoid(
     Step::from_to(
         device,
         label,
-        include_str!("../../shaders/sigmoid.wgsl"),
+        ("sigmoid", include_str!("../../shaders/sigmoid.wgsl")),
         &[("LENGTH", input.texels() as f64)],
         (input, output),
         input.texels(),

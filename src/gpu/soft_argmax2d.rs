@@ -1,4 +1,4 @@
-use super::step::{Step, StepDescriptor};
+use super::step::{Step, StepDescriptor, Work};
 use super::tensor::Tensor;
 use super::{Device, GpuError};
 
@@ -18,6 +18,7 @@ pub(super) fn soft_argmax2d(
         device,
         &StepDescriptor {
             label,
+            kernel: "soft_argmax2d",
             source: include_str!("../../shaders/soft_argmax2d.wgsl"),
             entry_point: "main",
             constants: &[
@@ -36,6 +37,7 @@ pub(super) fn soft_argmax2d(
                 (2, output.buffer.as_entire_binding()),
             ],
             workgroups: heat.batch * joints,
+            work: Work::new(&[heat, votes], 0, 0, output),
         },
     )
 }

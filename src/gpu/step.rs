@@ -4,15 +4,41 @@ use super::{Device, GpuError};
 /// One dispatch of a kernel: all that encoding it needs, made once.
 #[derive(Debug)]
 pub struct Step {
+    label: String,
+    kernel: &'static str,
+    work: Work,
     pipeline: wgpu::ComputePipeline,
     bind_group: wgpu::BindGroup,
     workgroups: [u32; 2],
+}
+
+/// What a step has to do, by the shapes of what it reads and writes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Work {
+    /// Multiply-adds of convolutions and dense layers, two each. Other arithmetic is not counted: it
+    /// hides behind its loads and stores.
+    pub operations: u64,
+    /// Activations read, activations written and parameters, each once.
+    pub bytes: u64,
+}
+
+impl Work {
+    /// Reads `inputs` and `parameters` values, does `macs` multiply-adds an image, writes `output`.
+    pub(super) fn new(inputs: &[&Tensor], parameters: usize, macs: usize, output: &Tensor) -> Self {
+        let activations: u64 = inputs.iter().map(|input| input.bytes()).sum();
+        Self {
+            operations: 2 * (output.batch * macs) as u64,
+            bytes: activations + (4 * parameters) as u64 + output.bytes(),
+        }
+    }
 }
 
 /// What a step is made of.
 pub(super) struct StepDescriptor<'a> {
     /// Names the step in profilers and driver messages.
     pub label: &'a str,
+    /// The name of the kernel's file in `shaders/`.
+    pub kernel: &'static str,
     /// The kernel's WGSL.
     pub source: &'a str,
     /// Its entry point.
@@ -24,6 +50,8 @@ pub(super) struct StepDescriptor<'a> {
     /// Number of workgroups. The kernel works out its index as `y * num_workgroups.x + x`, and
     /// passes over indices beyond its work.
     pub workgroups: usize,
+    /// What it has to do.
+    pub work: Work,
 }
 
 impl Step {
@@ -60,6 +88,9 @@ impl Step {
             (row * row) as u64,
         )?;
         Ok(Self {
+            label: step.label.to_owned(),
+            kernel: step.kernel,
+            work: step.work,
             pipeline,
             bind_group,
             workgroups: [x as u32, y as u32],
@@ -71,7 +102,7 @@ impl Step {
     pub(super) fn from_to(
         device: &Device,
         label: &str,
-        source: &str,
+        (kernel, source): (&'static str, &str),
         constants: &[(&str, f64)],
         (input, output): (&Tensor, &Tensor),
         invocations: usize,
@@ -80,6 +111,7 @@ impl Step {
             device,
             &StepDescriptor {
                 label,
+                kernel,
                 source,
                 entry_point: "main",
                 constants,
@@ -88,8 +120,24 @@ impl Step {
                     (1, output.buffer.as_entire_binding()),
                 ],
                 workgroups: invocations.div_ceil(64),
+                work: Work::new(&[input], 0, 0, output),
             },
         )
+    }
+
+    /// The layer that it belongs to, as `network.layer`. A layer's steps follow each other.
+    pub fn label(&self) -> &str {
+        &self.label
+    }
+
+    /// The name of its kernel's file in `shaders/`.
+    pub fn kernel(&self) -> &'static str {
+        self.kernel
+    }
+
+    /// What it has to do.
+    pub fn work(&self) -> Work {
+        self.work
     }
 
     /// Binds other resources to the same kernel.
@@ -97,7 +145,9 @@ impl Step {
         &mut self,
         device: &Device,
         bindings: &[(u32, wgpu::BindingResource<'_>)],
+        work: Work,
     ) {
+        self.work = work;
         self.bind_group = bind(device, &self.pipeline, bindings);
     }
 

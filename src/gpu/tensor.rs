@@ -39,6 +39,11 @@ impl Tensor {
         self.batch * blocks(self.shape.channels) * self.shape.height * self.shape.width
     }
 
+    /// Bytes of the values of the whole batch, without unused lanes.
+    pub fn bytes(&self) -> u64 {
+        4 * (self.batch * self.shape.len()) as u64
+    }
+
     /// Writes `[image][channel][row][column]` values at the queue's next submission.
     ///
     /// # Errors

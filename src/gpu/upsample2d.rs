@@ -14,7 +14,7 @@ pub(super) fn upsample2d(
     Step::from_to(
         device,
         label,
-        include_str!("../../shaders/upsample2d.wgsl"),
+        ("upsample2d", include_str!("../../shaders/upsample2d.wgsl")),
         &[
             ("PLANES", planes as f64),
             ("IN_HEIGHT", input.shape.height as f64),

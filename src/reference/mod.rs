@@ -22,7 +22,7 @@ pub use conv2d::conv2d;
 pub use coverage::coverage;
 pub use dense::dense;
 pub use max_pool2d::max_pool2d;
-pub use network::{run, run_all};
+pub use network::{run, run_all, run_each};
 pub use overlay::overlay;
 pub use rectify::rectify;
 pub use sigmoid::sigmoid;

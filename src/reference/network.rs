@@ -1,7 +1,7 @@
 use super::{
     Tensor, back_project, concat, conv2d, dense, max_pool2d, sigmoid, soft_argmax2d, upsample2d,
 };
-use crate::network::{Network, Operation, Source};
+use crate::network::{Network, Node, Operation, Source};
 
 /// The output of `network` for `input`, whose shape must be the network's; `None` where it is not.
 pub fn run(network: &Network, input: &Tensor) -> Option<Tensor> {
@@ -10,6 +10,15 @@ pub fn run(network: &Network, input: &Tensor) -> Option<Tensor> {
 
 /// The output of every layer of `network`, in order; `None` where `input` has not the network's shape.
 pub fn run_all(network: &Network, input: &Tensor) -> Option<Vec<Tensor>> {
+    run_each(network, input, |_| ())
+}
+
+/// As [`run_all`], and says which layer is done, right after it.
+pub fn run_each(
+    network: &Network,
+    input: &Tensor,
+    mut done: impl FnMut(&Node),
+) -> Option<Vec<Tensor>> {
     if input.shape() != network.input() {
         return None;
     }
@@ -50,6 +59,7 @@ pub fn run_all(network: &Network, input: &Tensor) -> Option<Vec<Tensor>> {
             Operation::BackProject => back_project(source),
         };
         outputs.push(output);
+        done(node);
     }
     Some(outputs)
 }

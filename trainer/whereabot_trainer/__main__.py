@@ -91,7 +91,7 @@ def main(argv=None):
 
     command = commands.add_parser("train-mask", help="train the mask network")
     _training_flags(command, minutes=40, batch=8, learning_rate=(4e-3, 2e-5), momentum=(0.95, 0.95),
-                    dilations=(1, 2, 4, 8, 1))
+                    dilations=(1, 3, 9, 27, 1))
     command.add_argument("--family", choices=("paper", "context"), default="paper",
                          help="the paper's network, or a wider one with skips that has no --dilations (%(default)s)")
     command.add_argument("--crop", nargs=2, type=int, default=(160, 128), metavar=("W", "H"),
