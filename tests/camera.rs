@@ -109,6 +109,22 @@ proptest! {
 }
 
 #[test]
+fn a_lens_whose_formula_has_a_pole_leads_back_too() {
+    // The denominator is 0 at a radius of 1.812, and the distorted radius of this ray beyond it.
+    let camera = camera(Distortion::Rational {
+        k: [0.2591447, 0.1199944, 0.0, -0.0904717, 0.0, -0.0198382],
+        p: [0.0; 2],
+    });
+    for r in [0.3, 1.1, 1.5] {
+        let pixel = camera.project([r, 0.0, 1.0]).unwrap();
+        let back = camera.unproject(pixel).unwrap();
+        assert!(distance(back, [r, 0.0]) < 1e-8, "{back:?} for {r}");
+        // Negative control: an answer at the pole is noticed.
+        assert!(distance([1.812, 0.0], [r, 0.0]) > 1e-2);
+    }
+}
+
+#[test]
 fn distortion_is_that_of_the_published_formulas() {
     // Worked out by hand from OpenCV's documentation at (0.3, -0.2): r^2 = 0.13.
     let rational = Distortion::Rational {

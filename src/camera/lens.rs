@@ -289,7 +289,10 @@ fn invert(target: f64, upper: f64, f: impl Fn(f64) -> (f64, f64)) -> Option<f64>
             low = argument;
         }
         let newton = argument - (value - target) / slope;
-        let next = if (low..=high).contains(&newton) {
+        // Beside a pole the slope is so steep that Newton's steps are small far from the target.
+        let stuck = (newton - argument).abs() <= CONVERGED * (1.0 + argument)
+            && (value - target).abs() > 1e-9 * (1.0 + target);
+        let next = if (low..=high).contains(&newton) && !stuck {
             newton
         } else {
             0.5 * (low + high)
