@@ -13,7 +13,7 @@ from . import __version__, data, evaluate
 from .model import describe, write_model
 from .train import load_network, output_unit
 
-SURE_THRESHOLDS = (0.7, 0.8, 0.9, 0.95)
+SURE_THRESHOLDS = (0.7, 0.8, 0.9, 0.95, 0.97, 0.98)
 
 
 def choose_presence(robots, without, passing=0.05):
