@@ -1,8 +1,8 @@
 use image::RgbaImage;
 
 use super::clock::now_ms;
-use super::report::{Adapter, Program, rounded};
-use super::statistics::Sample;
+use super::report::{Adapter, Program};
+use super::statistics::{Sample, rounded};
 use super::{
     BenchmarkError, CascadeFigures, IMAGE, LayerFigures, LayerWork, Options, Precision, Progress,
     Report, Timing, Weights, offered, rectification, source,

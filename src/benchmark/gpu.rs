@@ -1,7 +1,7 @@
 use super::clock::now_ms;
-use super::report::{Adapter, Program, rounded};
+use super::report::{Adapter, Program};
 use super::roofline::Roofline;
-use super::statistics::Sample;
+use super::statistics::{Sample, rounded};
 use super::timer::Timer;
 use super::{
     BenchmarkError, CascadeFigures, IMAGE, LayerFigures, LayerWork, Options, Precision, Progress,

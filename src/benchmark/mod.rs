@@ -23,8 +23,7 @@ pub use report::{
 };
 pub use roofline::Roofline;
 
-use report::rounded;
-use statistics::Sample;
+use statistics::{Sample, rounded};
 
 /// What to measure.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -296,12 +296,3 @@ pub struct Start {
     /// Why there is no figure, or what it means.
     pub note: String,
 }
-
-/// To six digits: more than a clock is good for.
-pub(super) fn rounded(value: f64) -> f64 {
-    if value == 0.0 || !value.is_finite() {
-        return value;
-    }
-    let scale = 10_f64.powi(5 - value.abs().log10().floor() as i32);
-    (value * scale).round() / scale
-}

@@ -1,6 +1,6 @@
 use serde::{Deserialize, Serialize};
 
-use super::report::rounded;
+use super::statistics::rounded;
 use super::timer::Timer;
 use crate::gpu::{ArithmeticProbe, Device, GpuError, Step, Work, copy_probe};
 
