@@ -20,22 +20,10 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     var a = vec4(f32(id.x));
     var b = a + 0.5;
     for (var round = 0u; round < rounds; round++) {
-        a = fma(a, factor, summand);
-        b = fma(b, factor, summand);
-        a = fma(a, factor, summand);
-        b = fma(b, factor, summand);
-        a = fma(a, factor, summand);
-        b = fma(b, factor, summand);
-        a = fma(a, factor, summand);
-        b = fma(b, factor, summand);
-        a = fma(a, factor, summand);
-        b = fma(b, factor, summand);
-        a = fma(a, factor, summand);
-        b = fma(b, factor, summand);
-        a = fma(a, factor, summand);
-        b = fma(b, factor, summand);
-        a = fma(a, factor, summand);
-        b = fma(b, factor, summand);
+        for (var i = 0u; i < 8u; i++) {
+            a = fma(a, factor, summand);
+            b = fma(b, factor, summand);
+        }
     }
     output[id.x] = a + b;
 }
