@@ -13,10 +13,11 @@ fn main(
     if place.plane >= OUTPUT_PLANES {
         return;
     }
-    let at = max((vec2(f32(place.x), f32(place.y)) + 0.5) / f32(SCALE) - 0.5, vec2(0.0));
-    let low = vec2<u32>(at);
+    // In half pixels of the output, as whole numbers: far from the origin, floats would be too coarse.
+    let at = max(2u * vec2(place.x, place.y) + 1u, vec2(SCALE)) - SCALE;
+    let low = at / (2u * SCALE);
     let high = min(low + 1u, vec2(INPUT_WIDTH, INPUT_HEIGHT) - 1u);
-    let part = at - vec2<f32>(low);
+    let part = vec2<f32>(at % (2u * SCALE)) / f32(2u * SCALE);
     let plane = place.plane;
     let value = mix(
         mix(input_at(plane, low.y, low.x), input_at(plane, low.y, high.x), part.x),

@@ -171,9 +171,14 @@ fn plain_rust_is_measured_by_the_wall_and_written_to_a_new_file() {
         "2",
         "--json",
         "new.json",
+        "--plot",
+        "new.png",
     ];
     let (stdout, stderr, code) = bench(folder.path(), &arguments);
     assert_eq!(code, 0, "{stderr}");
+    let picture = image::open(folder.path().join("new.png")).unwrap();
+    // A line a layer, the title and the legend.
+    assert!(picture.height() > 22 * 6);
     assert!(stdout.contains("plain Rust") && stdout.contains("mask.conv1"));
     let json = std::fs::read(folder.path().join("new.json")).unwrap();
     let report: Value = serde_json::from_slice(&json).unwrap();

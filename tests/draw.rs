@@ -134,7 +134,7 @@ fn an_image_of_one_pixel_has_a_mask_of_one_pixel() {
 #[cfg(feature = "cli")]
 mod annotated {
     use super::*;
-    use whereabot::draw::{JOINT_COLOURS, annotated};
+    use whereabot::draw::{JOINT_COLOURS, Row, RowChart, annotated, row_chart};
 
     fn photo() -> RgbaImage {
         RgbaImage::from_fn(256, 192, |x, y| Rgba([x as u8, y as u8, 90, 255]))
@@ -198,5 +198,33 @@ mod annotated {
         assert_eq!(picture.dimensions(), (1, 1));
         let empty = annotated(&RgbaImage::new(0, 0), &GrayImage::new(0, 0), &[[0.0, 0.0]]);
         assert_eq!(empty.dimensions(), (0, 0));
+    }
+
+    #[test]
+    fn rows_are_as_long_as_their_values_and_coloured_by_kind() {
+        let row = |name: &str, kind: &str, value| Row {
+            name: name.into(),
+            kind: kind.into(),
+            value,
+            note: String::new(),
+        };
+        let chart = RowChart {
+            title: "where the time goes".into(),
+            rows: vec![row("a", "x", 4.0), row("b", "y", 1.0), row("c", "y", 0.0)],
+        };
+        let picture = row_chart(&chart).unwrap();
+        // From the most frequent colours: white, then the bars.
+        let mut counts = std::collections::HashMap::new();
+        for pixel in picture.pixels() {
+            *counts.entry(pixel.0).or_insert(0) += 1;
+        }
+        let mut counts: Vec<_> = counts.into_iter().map(|(c, n)| (n, c)).collect();
+        counts.sort_unstable();
+        let [.., (second, _), (first, _), (_, white)] = counts.as_slice() else {
+            panic!("{counts:?}")
+        };
+        assert_eq!(*white, [255; 3]);
+        let ratio = f64::from(*first) / f64::from(*second);
+        assert!((3.0..5.0).contains(&ratio), "{ratio}");
     }
 }

@@ -10,14 +10,15 @@ use std::time::Instant;
 use anyhow::{Context, anyhow, bail, ensure};
 use clap::CommandFactory;
 use clap::error::ErrorKind;
-use image::RgbaImage;
+use image::{ImageFormat, RgbImage, RgbaImage};
 use indicatif::ProgressBar;
 
 use super::engine::{self, PrecisionName};
 use super::weights;
-use crate::benchmark::{self, Options, Report, Start, Weights, compare};
+use crate::benchmark::{self, LayerFigures, Options, Report, Start, Weights, compare};
 use crate::camera::Camera;
 use crate::cascade::Output;
+use crate::draw::{self, Row, RowChart};
 use crate::gpu::Precision;
 use crate::network::Model;
 
@@ -47,6 +48,9 @@ pub struct Args {
     /// error)
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
+    /// Draw where the time goes, layer by layer, at the first batch size, into this new file (PNG)
+    #[arg(long, value_name = "FILE")]
+    plot: Option<PathBuf>,
     /// Compare with the figures that --json wrote earlier; two files are compared with each other, and
     /// nothing is measured
     #[arg(long, value_name = "FILE", num_args(1..=2))]
@@ -78,7 +82,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let json = args.json.as_deref();
     let to_stdout = json.is_some_and(|file| file.as_os_str() == "-");
-    if let Some(file) = json.filter(|_| !to_stdout) {
+    for file in json
+        .filter(|_| !to_stdout)
+        .into_iter()
+        .chain(args.plot.as_deref())
+    {
         // Better said before minutes of measuring than after.
         ensure_new(file)?;
     }
@@ -104,7 +112,39 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             .and_then(|mut file| file.write_all(figures.as_bytes()))
             .with_context(|| format!("{}: cannot be written", file.display()))?;
     }
+    if let Some(file) = &args.plot {
+        layers_picture(&report)?
+            .save_with_format(file, ImageFormat::Png)
+            .with_context(|| format!("{}: cannot be written", file.display()))?;
+    }
     Ok(ExitCode::SUCCESS)
+}
+
+/// The layers of the first batch size and precision as bars, coloured by kernel.
+fn layers_picture(report: &Report) -> anyhow::Result<RgbImage> {
+    let first = report.layers.first().map(|l| (l.batch, l.precision));
+    let of_first = |l: &&LayerFigures| Some((l.batch, l.precision)) == first;
+    let layers: Vec<_> = report.layers.iter().filter(of_first).collect();
+    let all: f64 = layers.iter().map(|layer| layer.ms_p50).sum();
+    let row = |layer: &&LayerFigures| Row {
+        name: layer.layer.clone(),
+        kind: layer.kernel.clone(),
+        value: layer.ms_p50,
+        note: match layer.gflop_per_s {
+            Some(rate) if layer.gflop > 0.0 => format!("{:.2} ms, {rate:.0} GFLOP/s", layer.ms_p50),
+            _ => format!("{:.2} ms", layer.ms_p50),
+        },
+    };
+    let title = match first {
+        Some((batch, precision)) => format!(
+            "{all:.1} ms for {batch} image{}, {precision}, on {}",
+            if batch == 1 { "" } else { "s" },
+            report.adapter.name
+        ),
+        None => report.adapter.name.clone(),
+    };
+    let rows = layers.iter().map(row).collect();
+    Ok(draw::row_chart(&RowChart { title, rows })?)
 }
 
 impl Args {
@@ -119,6 +159,7 @@ impl Args {
             ("--precision", !self.precision.is_empty()),
             ("--frames", self.frames.is_some()),
             ("--json", self.json.is_some()),
+            ("--plot", self.plot.is_some()),
         ];
         if let Some((flag, _)) = wanted.iter().find(|(_, given)| *given) {
             let message = format!(

@@ -49,6 +49,28 @@ pub struct BarGroup {
     pub bars: Vec<[f64; 2]>,
 }
 
+/// A bar a row, coloured by kind.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RowChart {
+    /// What is shown, with its unit.
+    pub title: String,
+    /// The rows from top to bottom.
+    pub rows: Vec<Row>,
+}
+
+/// A row of a [`RowChart`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct Row {
+    /// What stands before the bar.
+    pub name: String,
+    /// What its colour means.
+    pub kind: String,
+    /// Its length, finite and not negative.
+    pub value: f64,
+    /// What stands behind the bar.
+    pub note: String,
+}
+
 const PANEL: (u32, u32) = (560, 400);
 const FONT: &str = "sans-serif";
 const TEXT: f64 = 15.0;
@@ -80,6 +102,59 @@ pub fn line_charts(charts: &[LineChart]) -> Result<RgbImage, ChartError> {
 /// The drawing library's.
 pub fn bar_charts(charts: &[BarChart]) -> Result<RgbImage, ChartError> {
     side_by_side(charts, bar_chart)
+}
+
+/// A chart as high as its rows need, the legend below.
+///
+/// # Errors
+/// The drawing library's.
+pub fn row_chart(chart: &RowChart) -> Result<RgbImage, ChartError> {
+    const LINE: i32 = 22;
+    const WIDTH: i32 = 900;
+    const NAMES: i32 = 130;
+    const NOTES: i32 = 260;
+    let mut kinds: Vec<&str> = Vec::new();
+    for row in &chart.rows {
+        if !kinds.contains(&row.kind.as_str()) {
+            kinds.push(&row.kind);
+        }
+    }
+    let colour_of = |kind: &str| {
+        let place = kinds.iter().position(|k| *k == kind).unwrap_or(0);
+        COLOURS.iter().cycle().nth(place).copied().unwrap_or(INK)
+    };
+    let top = chart.rows.iter().map(|row| row.value).fold(1e-9, f64::max);
+    let lines = chart.rows.len() as i32 + kinds.len().div_ceil(3) as i32 + 3;
+    let mut image = RgbImage::new(WIDTH as u32, (lines * LINE) as u32);
+    on_canvas(&mut image, |canvas| {
+        canvas.fill(&WHITE).map_err(failed)?;
+        let text = |text: &str, x: i32, y: i32, size: f64| {
+            let style = (FONT, size).into_font().color(&INK);
+            canvas.draw_text(text, &style, (x, y)).map_err(failed)
+        };
+        let bar = |kind: &str, x: i32, y: i32, width: i32| {
+            let corners = [(x, y + 2), (x + width.max(1), y + LINE - 4)];
+            let bar = Rectangle::new(corners, colour_of(kind).filled());
+            canvas.draw(&bar).map_err(failed)
+        };
+        text(&chart.title, 12, 8, 1.2 * TEXT)?;
+        let mut y = 2 * LINE - LINE / 2;
+        for row in &chart.rows {
+            let length = f64::from(WIDTH - NAMES - NOTES) * row.value / top;
+            text(&row.name, 12, y + 1, TEXT)?;
+            bar(&row.kind, NAMES, y, length as i32)?;
+            text(&row.note, NAMES + length as i32 + 8, y + 1, TEXT)?;
+            y += LINE;
+        }
+        y += LINE / 2;
+        for (number, kind) in (0..).zip(&kinds) {
+            let (x, y) = (12 + number % 3 * 290, y + number / 3 * LINE);
+            bar(kind, x, y, LINE - 6)?;
+            text(kind, x + LINE, y + 1, TEXT)?;
+        }
+        Ok(())
+    })?;
+    Ok(image)
 }
 
 fn side_by_side<T>(

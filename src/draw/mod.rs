@@ -11,7 +11,10 @@ mod sheet;
 #[cfg(feature = "cli")]
 pub use annotated::{JOINT_COLOURS, annotated};
 #[cfg(feature = "cli")]
-pub use chart::{BarChart, BarGroup, ChartError, Line, LineChart, bar_charts, line_charts};
+pub use chart::{
+    BarChart, BarGroup, ChartError, Line, LineChart, Row, RowChart, bar_charts, line_charts,
+    row_chart,
+};
 pub use mask::mask_image;
 #[cfg(feature = "cli")]
 pub use sheet::{SheetRow, sheet};

@@ -31,7 +31,9 @@ pub fn upsample2d(input: &Tensor, scale: usize) -> Tensor {
 
 /// The two input pixels round output pixel `index`, and the share of the second.
 fn neighbours(index: usize, scale: usize, side: usize) -> (usize, usize, f32) {
-    let at = ((index as f32 + 0.5) / scale as f32 - 0.5).max(0.0);
-    let low = (at as usize).min(side - 1);
-    (low, (low + 1).min(side - 1), at - low as f32)
+    // In half pixels of the output.
+    let at = (2 * index + 1).max(scale) - scale;
+    let low = at / (2 * scale);
+    let part = (at % (2 * scale)) as f32 / (2 * scale) as f32;
+    (low, (low + 1).min(side - 1), part)
 }
