@@ -231,8 +231,8 @@ fn main() -> Result<()> {
             let picture = TensorData::new(picture.to_vec(), [1, 3, height, width]);
             let picture = Tensor::<4>::from_data(picture, &device);
             let mask = model.mask_network.run("image", picture.clone())?;
-            // Read before the overlay is asked for: fused with a product over more channels, burn 0.22 takes the sigmoid
-            // in place, of its own results too.
+            // Read before the overlay is asked for: fused with it, burn 0.22 takes the sigmoid in place, of its own
+            // results too.
             let found = mask.clone().into_data();
             let seen = match model.overlay {
                 Overlay::Multiply => mask,
