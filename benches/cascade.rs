@@ -11,7 +11,7 @@ use criterion::{Criterion, criterion_group, criterion_main};
 use image::RgbaImage;
 use whereabot::camera::{Camera, Rectification};
 use whereabot::cascade::{Locator, Output};
-use whereabot::gpu::{AdapterRequest, Device, Plan};
+use whereabot::gpu::{AdapterRequest, Device, Plan, Precision};
 use whereabot::network::Model;
 use whereabot::reference;
 
@@ -27,7 +27,7 @@ fn cascade(criterion: &mut Criterion) {
 
     let mut group = criterion.benchmark_group("locate");
     group.sample_size(10);
-    let mut gpu = Locator::on_gpu(Arc::clone(&device), &model).unwrap();
+    let mut gpu = Locator::on_gpu(Arc::clone(&device), &model, Precision::F32).unwrap();
     let mut cpu = Locator::on_cpu(&model);
     for (name, locator) in [("gpu", &mut gpu), ("reference", &mut cpu)] {
         for (what, mask_only) in [("mask and joints", false), ("mask only", true)] {
@@ -46,7 +46,7 @@ fn cascade(criterion: &mut Criterion) {
     group.sample_size(10);
     group.bench_function("load the model", |b| b.iter(|| Model::load(&file).unwrap()));
     group.bench_function("plan it", |b| {
-        b.iter(|| Locator::on_gpu(Arc::clone(&device), &model).unwrap());
+        b.iter(|| Locator::on_gpu(Arc::clone(&device), &model, Precision::F32).unwrap());
     });
     group.finish();
 
@@ -59,7 +59,7 @@ fn cascade(criterion: &mut Criterion) {
     group.bench_function("rectify, reference", |b| {
         b.iter(|| reference::rectify(black_box(&image), &rectification, rows, columns));
     });
-    let mut plan = Plan::new(&device, &model, 1).unwrap();
+    let mut plan = Plan::new(&device, &model, 1, Precision::F32).unwrap();
     plan.write(&device, 0, &image, &rectification).unwrap();
     group.bench_function("encode and submit", |b| {
         b.iter_custom(|frames| {

@@ -1,9 +1,8 @@
 // Convolution with stride 1, dilation and zero padding 'same', from buffer to buffer; bias and
-// activation fused.
+// activation fused: on every adapter.
 //
-// An invocation makes COLUMNS pixels of
-// one row, TILES apart so that neighbouring invocations read neighbouring texels, in eight output
-// channels: two blocks of four.
+// An invocation makes COLUMNS pixels of one row, TILES apart so that neighbouring invocations read
+// neighbouring texels, in eight output channels: two blocks of four.
 
 override KERNEL: u32;
 override DILATION: u32;
@@ -67,19 +66,19 @@ fn main(
         }
         for (var kx = 0u; kx < KERNEL; kx++) {
             var inside: array<bool, COLUMNS>;
-            var offset: array<u32, COLUMNS>;
+            var in_x: array<u32, COLUMNS>;
             for (var i = 0u; i < COLUMNS; i++) {
-                let in_x = i32(tile + i * TILES + kx * DILATION) - reach;
-                inside[i] = in_x >= 0 && in_x < i32(WIDTH);
-                offset[i] = (image * HEIGHT + u32(in_y)) * WIDTH
-                    + u32(clamp(in_x, 0, i32(WIDTH) - 1));
+                let x = i32(tile + i * TILES + kx * DILATION) - reach;
+                inside[i] = x >= 0 && x < i32(WIDTH);
+                in_x[i] = u32(clamp(x, 0, i32(WIDTH) - 1));
             }
             let tap = (ky * KERNEL + kx) * IN_BLOCKS;
             for (var block = 0u; block < IN_BLOCKS; block++) {
                 let weight_low = weights[first * taps + tap + block];
                 let weight_high = weights[second * taps + tap + block];
                 for (var i = 0u; i < COLUMNS; i++) {
-                    let value = select(vec4(0.0), input[offset[i] + block * BATCH * HEIGHT * WIDTH], inside[i]);
+                    let texel = input_at(block * BATCH + image, u32(in_y), in_x[i]);
+                    let value = select(vec4(0.0), texel, inside[i]);
                     low[i] += weight_low * value;
                     high[i] += weight_high * value;
                 }

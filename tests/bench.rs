@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use tempfile::TempDir;
 use whereabot::benchmark::{self, Options, Report, Timing, Weights, compare};
 use whereabot::camera::{Camera, Rectification};
-use whereabot::gpu::{AdapterRequest, Device, GpuError, Plan};
+use whereabot::gpu::{AdapterRequest, Device, GpuError, Plan, Precision};
 use whereabot::network::Model;
 
 /// A folder with a model of four layers.
@@ -294,7 +294,7 @@ fn without_timestamps_the_wall_clock_is_used_and_named() {
 #[test]
 fn a_plan_hands_out_its_steps_in_order_with_all_their_work() {
     let model = Model::from_bytes(&model_file(&description(32, 24, 4), 1), "random").unwrap();
-    let plan = Plan::new(&common::device(), &model, 3).unwrap();
+    let plan = Plan::new(&common::device(), &model, 3, Precision::F32).unwrap();
     let macs = |joints| {
         let joint = if joints {
             model.joint_network.macs()
@@ -321,7 +321,7 @@ fn a_steady_frame_leaves_nothing_behind() {
     // Of its own: tests run side by side.
     let device = Device::open(&AdapterRequest::new(None, None)).unwrap();
     let model = Model::from_bytes(&model_file(&description(32, 24, 4), 1), "random").unwrap();
-    let mut plan = Plan::new(&device, &model, 1).unwrap();
+    let mut plan = Plan::new(&device, &model, 1, Precision::F32).unwrap();
     let mut frame = |width, height| {
         let camera = Camera::assumed(width, height);
         let rectification = Rectification::new(&camera, &model.description.camera, 32, 24);
@@ -343,6 +343,52 @@ fn a_steady_frame_leaves_nothing_behind() {
 }
 
 #[test]
+fn the_fastest_kernels_are_remembered_in_the_users_cache() {
+    let folder = folder();
+    let (cache, ours) = (folder.path().join("cache"), "cache/whereabot");
+    // Of halves, as between textures there is nothing to find out.
+    let run = |arguments: &[&str]| {
+        let given = ["bench", "--precision", "f16", "--frames", "1"];
+        let output = command(folder.path())
+            .args(given)
+            .args(["--weights", "model.safetensors"])
+            .args(arguments)
+            .env("XDG_CACHE_HOME", &cache)
+            .output()
+            .unwrap();
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(0), "{stderr}");
+        assert!(!stderr.contains("not used"), "{stderr}");
+        String::from_utf8(output.stdout).unwrap()
+    };
+    assert!(run(&["--no-tuning"]).contains("f16"));
+    assert!(!folder.path().join(ours).exists());
+    run(&[]);
+    let files: Vec<_> = std::fs::read_dir(folder.path().join(ours))
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .collect();
+    let [file] = files.as_slice() else {
+        panic!("{files:?}")
+    };
+    let first = std::fs::read_to_string(file).unwrap();
+    assert!(first.contains("conv2d_"), "{first}");
+    // What is known stays, whatever was left to find out; what is corrupt is found out again.
+    run(&[]);
+    let second = std::fs::read_to_string(file).unwrap();
+    let known = first.lines().filter(|line| line.contains("conv2d_"));
+    for line in known {
+        assert!(
+            second.contains(line.trim_end_matches(',')),
+            "{line}: {second}"
+        );
+    }
+    std::fs::write(file, "{").unwrap();
+    run(&[]);
+    assert!(std::fs::read_to_string(file).unwrap().contains("conv2d_"));
+}
+
+#[test]
 fn bad_input_is_an_error_that_says_what_was_expected() {
     let folder = folder();
     std::fs::write(folder.path().join("corrupt.json"), "{\"schema\": 1, ").unwrap();
@@ -353,7 +399,11 @@ fn bad_input_is_an_error_that_says_what_was_expected() {
         (["--batch", "1,x"], 2, ["--batch", "x"]),
         (["--frames", "0"], 2, ["--frames", "0"]),
         (["--precision", "f64"], 2, ["--precision", "f64"]),
-        (["--precision", "f32,f16"], 1, ["precision f16", "f32"]),
+        (
+            ["--precision=f32,f16", "--adapter=cpu"],
+            1,
+            ["precision f16", "f32 only"],
+        ),
         (
             ["--batch", "100000000"],
             1,

@@ -7,7 +7,7 @@ use common::{description, device, difference, joints, model_file, noise};
 use image::RgbaImage;
 use whereabot::camera::{Camera, Rectification};
 use whereabot::cascade::{Estimate, Locator, Output, Status};
-use whereabot::gpu::{Frame, GpuError, Plan};
+use whereabot::gpu::{Frame, GpuError, Plan, Precision};
 use whereabot::network::{Layer, Model, Network, Operation};
 
 const ALL: Output = Output {
@@ -50,7 +50,7 @@ fn gpu_and_reference_agree() {
         let model = model(seed);
         let image = picture(width, height, seed);
         let camera = Camera::from_hfov(width, height, 70_f64.to_radians());
-        let gpu = Locator::on_gpu(device(), &model)
+        let gpu = Locator::on_gpu(device(), &model, Precision::F32)
             .unwrap()
             .locate(&image, &camera, ALL)
             .unwrap();
@@ -68,7 +68,7 @@ fn gpu_and_reference_agree() {
 fn another_picture_is_noticed() {
     let model = model(1);
     let camera = Camera::from_hfov(512, 424, 70_f64.to_radians());
-    let mut locator = Locator::on_gpu(device(), &model).unwrap();
+    let mut locator = Locator::on_gpu(device(), &model, Precision::F32).unwrap();
     let first = locator.locate(&picture(512, 424, 1), &camera, ALL).unwrap();
     let second = locator.locate(&picture(512, 424, 9), &camera, ALL).unwrap();
     let again = locator.locate(&picture(512, 424, 1), &camera, ALL).unwrap();
@@ -83,7 +83,7 @@ fn a_batch_gives_what_single_images_give() {
     let device = device();
     let sizes = [(48, 40), (61, 33), (100, 90)];
     let frames = |batch: &[(u32, u32)]| -> Vec<Frame> {
-        let mut plan = Plan::new(&device, &model, batch.len()).unwrap();
+        let mut plan = Plan::new(&device, &model, batch.len(), Precision::F32).unwrap();
         for (index, &(width, height)) in batch.iter().enumerate() {
             let camera = Camera::from_hfov(width, height, 1.2);
             let image = picture(width, height, width.into());
@@ -103,17 +103,19 @@ fn a_batch_gives_what_single_images_give() {
     // Negative control: the images differ.
     assert!(difference(&together[0].mask, &together[1].mask).unwrap() > 1e-3);
     assert!(matches!(
-        Plan::new(&device, &model, 1).unwrap().write(
-            &device,
-            1,
-            &picture(48, 40, 1),
-            &Rectification::new(
-                &Camera::from_hfov(48, 40, 1.0),
-                &model.description.camera,
-                48,
-                40
-            )
-        ),
+        Plan::new(&device, &model, 1, Precision::F32)
+            .unwrap()
+            .write(
+                &device,
+                1,
+                &picture(48, 40, 1),
+                &Rectification::new(
+                    &Camera::from_hfov(48, 40, 1.0),
+                    &model.description.camera,
+                    48,
+                    40
+                )
+            ),
         Err(GpuError::Size { .. })
     ));
 }
@@ -124,7 +126,7 @@ fn only_what_was_asked_for_is_answered() {
     let camera = Camera::from_hfov(48, 40, 1.2);
     let image = picture(48, 40, 1);
     for mut locator in [
-        Locator::on_gpu(device(), &model).unwrap(),
+        Locator::on_gpu(device(), &model, Precision::F32).unwrap(),
         Locator::on_cpu(&model),
     ] {
         let mask_only = Output {
@@ -208,7 +210,7 @@ fn what_is_no_result_is_not_reported_as_one() {
     ];
     for (model, status) in cases {
         for mut locator in [
-            Locator::on_gpu(device(), &model).unwrap(),
+            Locator::on_gpu(device(), &model, Precision::F32).unwrap(),
             Locator::on_cpu(&model),
         ] {
             let found = locator.locate(&image, &camera, Output::default()).unwrap();

@@ -4,8 +4,8 @@
 mod common;
 
 use common::{
-    check_in_buffers, check_layer, check_network_by, device, difference, noise, on_gpu, on_gpu_by,
-    on_reference, one_layer, rounding,
+    check_in_buffers, check_layer, check_network_by, device, difference, in_halves, noise, on_gpu,
+    on_gpu_by, on_reference, one_layer, rounding,
 };
 use proptest::prelude::*;
 use whereabot::gpu::{Conv2dKernel, Layout, NetworkPlan};
@@ -92,7 +92,9 @@ proptest! {
             let out_channels = channels_for(kernel, out_channels);
             let network = one_layer(conv2d(out_channels, side, dilation, activation), input, seed.into());
             let tolerance = rounding(channels * side * side);
-            check_network_by(kernel.layout(), Some(kernel), &network, batch, seed.into(), tolerance);
+            for &layout in kernel.layouts() {
+                check_network_by(layout, Some(kernel), &network, batch, seed.into(), tolerance);
+            }
         }
     }
 }
@@ -100,14 +102,21 @@ proptest! {
 #[test]
 fn each_kernel_notices_a_wrong_weight() {
     let input = Shape::new(6, 9, 11);
-    let values = noise(2 * input.len(), 2);
+    let values = in_halves(&noise(2 * input.len(), 2));
     for kernel in kernels() {
         let out_channels = channels_for(kernel, 5);
         let network = one_layer(conv2d(out_channels, 3, 2, Activation::None), input, 1);
-        let other = common::with_one_weight_changed(&network, 1e-2);
-        let gpu = on_gpu_by(kernel.layout(), Some(kernel), &network, 2, &values);
-        assert!(difference(&gpu, &on_reference(&network, &values)).unwrap() < 1e-5);
-        assert!(difference(&gpu, &on_reference(&other, &values)).unwrap() > 1e-3);
+        let other = common::with_one_weight_changed(&network, 2e-2);
+        for &layout in kernel.layouts() {
+            let gpu = on_gpu_by(layout, Some(kernel), &network, 2, &values);
+            let right = if layout == Layout::HalfBuffer {
+                2e-3
+            } else {
+                1e-5
+            };
+            assert!(difference(&gpu, &on_reference(&network, &values)).unwrap() < right);
+            assert!(difference(&gpu, &on_reference(&other, &values)).unwrap() > 2.0 * right);
+        }
     }
 }
 

@@ -5,7 +5,7 @@ mod common;
 
 use common::{device, noise};
 use proptest::prelude::*;
-use whereabot::gpu::{Layout, Tensor, Totals, coverage};
+use whereabot::gpu::{Layout, Precision, Tensor, Totals, coverage};
 use whereabot::network::{Coverage, Shape};
 use whereabot::reference;
 
@@ -18,7 +18,7 @@ fn run(mask: &[f32], height: usize, width: usize, batch: usize, threshold: f32) 
     let layout = if batch > 1000 {
         Layout::Buffer
     } else {
-        device.layout()
+        device.layout(Precision::F32).unwrap()
     };
     let tensor = Tensor::in_layout(&device, layout, "mask", shape, batch, 0).unwrap();
     tensor.write(&device, mask).unwrap();

@@ -11,7 +11,7 @@ use image::RgbaImage;
 use whereabot::camera::Camera;
 use whereabot::cascade::{LocateError, Locator, Output};
 use whereabot::gpu::{
-    AdapterRequest, Device, GpuError, Layout, NetworkPlan, Tensor, list_adapters,
+    AdapterRequest, Device, GpuError, Layout, NetworkPlan, Precision, Tensor, list_adapters,
 };
 use whereabot::network::{Activation, Model, Operation, Shape};
 
@@ -42,7 +42,7 @@ fn an_unknown_adapter_lists_what_there_is() {
 fn a_destroyed_device_is_an_error_and_not_a_result() {
     let device = Arc::new(open());
     let model = Model::from_bytes(&model_file(&description(32, 24, 4), 1), "random").unwrap();
-    let mut locator = Locator::on_gpu(Arc::clone(&device), &model).unwrap();
+    let mut locator = Locator::on_gpu(Arc::clone(&device), &model, Precision::F32).unwrap();
     let image = RgbaImage::new(40, 30);
     let camera = Camera::from_hfov(40, 30, 1.0);
     // Negative control: before, there is a result.
@@ -61,7 +61,7 @@ fn a_destroyed_device_is_an_error_and_not_a_result() {
     locator
         .locate(&image, &camera, Output::default())
         .unwrap_err();
-    Locator::on_gpu(Arc::new(open()), &model)
+    Locator::on_gpu(Arc::new(open()), &model, Precision::F32)
         .unwrap()
         .locate(&image, &camera, Output::default())
         .unwrap();
@@ -114,7 +114,7 @@ fn an_image_beyond_the_adapter_s_limits_is_refused() {
     let device = common::device();
     let side = device.wgpu().limits().max_texture_dimension_2d + 1;
     let model = Model::from_bytes(&model_file(&description(32, 24, 4), 1), "random").unwrap();
-    let mut locator = Locator::on_gpu(Arc::clone(&device), &model).unwrap();
+    let mut locator = Locator::on_gpu(Arc::clone(&device), &model, Precision::F32).unwrap();
     let camera = Camera::from_hfov(side, 2, 1.0);
     let error = locator.locate(&RgbaImage::new(side, 2), &camera, Output::default());
     assert!(matches!(

@@ -19,6 +19,7 @@ use whereabot::evaluation::{
     EvaluationError, Figures, JointErrors, JointScore, MaskCounts, Score, Summary, distances_cm,
     distances_px, network_mask, read_annotations,
 };
+use whereabot::gpu::Precision;
 use whereabot::network::Model;
 use whereabot::recording::{HEIGHT, INTRINSICS, WIDTH};
 
@@ -197,7 +198,7 @@ fn joints_follow_the_mask_that_is_given() {
     };
     let mut answers = Vec::new();
     for mut locator in [
-        Locator::on_gpu(device(), &model).unwrap(),
+        Locator::on_gpu(device(), &model, Precision::F32).unwrap(),
         Locator::on_cpu(&model),
     ] {
         let estimate = locator.locate(&image, &camera, all).unwrap();

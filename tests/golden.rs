@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use common::{difference, with_one_weight_changed};
 use safetensors::SafeTensors;
-use whereabot::gpu::NetworkPlan;
+use whereabot::gpu::{NetworkPlan, Precision};
 use whereabot::network::{Model, Network, Shape};
 use whereabot::reference;
 
@@ -126,7 +126,14 @@ fn every_layer_of_the_gpu_agrees_with_pytorch() {
             (&model.joint_network, "joint", "overlay"),
         ];
         for (network, prefix, source) in networks {
-            let input = NetworkPlan::input(&device, device.layout(), "input", network, 1).unwrap();
+            let input = NetworkPlan::input(
+                &device,
+                device.layout(Precision::F32).unwrap(),
+                "input",
+                network,
+                1,
+            )
+            .unwrap();
             input
                 .write(&device, &golden(name, &format!("{prefix}.{source}")))
                 .unwrap();

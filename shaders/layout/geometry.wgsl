@@ -8,16 +8,19 @@ override INPUT_PLANES: u32 = 1u;
 override INPUT_HEIGHT: u32 = 1u;
 override INPUT_WIDTH: u32 = 1u;
 override INPUT_MARGIN: u32 = 0u;
+override INPUT_FULL: bool = true;
 
 override SECOND_PLANES: u32 = 1u;
 override SECOND_HEIGHT: u32 = 1u;
 override SECOND_WIDTH: u32 = 1u;
 override SECOND_MARGIN: u32 = 0u;
+override SECOND_FULL: bool = true;
 
 override OUTPUT_PLANES: u32 = 1u;
 override OUTPUT_HEIGHT: u32 = 1u;
 override OUTPUT_WIDTH: u32 = 1u;
 override OUTPUT_MARGIN: u32 = 0u;
+override OUTPUT_FULL: bool = true;
 
 // Where a texel is in its stack.
 struct Place {

@@ -4,12 +4,12 @@ use super::clock::now_ms;
 use super::report::{Adapter, Program};
 use super::statistics::{Sample, rounded};
 use super::{
-    BenchmarkError, CascadeFigures, IMAGE, LayerFigures, LayerWork, Options, Precision, Progress,
-    Report, Timing, Weights, offered, rectification, source,
+    BenchmarkError, CascadeFigures, IMAGE, LayerFigures, LayerWork, Options, Progress, Report,
+    Timing, Weights, rectification, source,
 };
 use crate::camera::Rectification;
 use crate::cascade::LocateError;
-use crate::gpu::Work;
+use crate::gpu::{Precision, Work};
 use crate::network::{Model, Network, Node, Shape, Source};
 use crate::reference;
 
@@ -20,7 +20,9 @@ pub(super) fn measure(
     progress: Progress<'_>,
 ) -> Result<Report, BenchmarkError> {
     for &precision in &options.precisions {
-        offered(precision, None)?;
+        if precision != Precision::F32 {
+            return Err(BenchmarkError::Precision(precision));
+        }
     }
     let mut report = Report {
         schema: Report::SCHEMA,

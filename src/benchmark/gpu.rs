@@ -4,11 +4,11 @@ use super::roofline::Roofline;
 use super::statistics::{Sample, rounded};
 use super::timer::Timer;
 use super::{
-    BenchmarkError, CascadeFigures, IMAGE, LayerFigures, LayerWork, Options, Precision, Progress,
-    Report, Timing, Weights, offered, rectification, source,
+    BenchmarkError, CascadeFigures, IMAGE, LayerFigures, LayerWork, Options, Progress, Report,
+    Timing, Weights, rectification, source,
 };
 use crate::camera::Rectification;
-use crate::gpu::{Device, GpuError, Plan, Step, Work};
+use crate::gpu::{Device, GpuError, Plan, Precision, Step, Work};
 use crate::network::Model;
 
 pub(super) fn measure(
@@ -18,9 +18,6 @@ pub(super) fn measure(
     options: &Options,
     progress: Progress<'_>,
 ) -> Result<Report, BenchmarkError> {
-    for &precision in &options.precisions {
-        offered(precision, Some(device.tier()))?;
-    }
     progress("what the adapter can reach");
     let features = device.wgpu().features();
     let mut timestamps = options.timestamps && features.contains(wgpu::Features::TIMESTAMP_QUERY);
@@ -51,7 +48,8 @@ pub(super) fn measure(
     };
     for &precision in &options.precisions {
         for &batch in &options.batches {
-            let measured = Batch::plan(device, model, batch, timestamps).and_then(|mut planned| {
+            let planned = Batch::plan(device, model, batch, precision, timestamps);
+            let measured = planned.and_then(|mut planned| {
                 progress(&format!("batch {batch}, {precision}: cascade"));
                 let cascade = planned.cascade(device, precision, options)?;
                 progress(&format!("batch {batch}, {precision}: layers"));
@@ -93,11 +91,12 @@ impl Batch {
         device: &Device,
         model: &Model,
         batch: usize,
+        precision: Precision,
         timestamps: bool,
     ) -> Result<Self, GpuError> {
         let allocated_before = allocated(device);
         let start = now_ms();
-        let plan = Plan::new(device, model, batch)?;
+        let plan = Plan::new(device, model, batch, precision)?;
         Ok(Self {
             plan_ms: now_ms() - start,
             plan,

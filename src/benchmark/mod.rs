@@ -15,12 +15,10 @@ use image::{Rgba, RgbaImage};
 
 use crate::camera::{Camera, Rectification};
 use crate::cascade::LocateError;
-use crate::gpu::{Device, GpuError, Tier, Work};
+use crate::gpu::{Device, GpuError, Precision, Work};
 use crate::network::Model;
 pub use comparison::compare;
-pub use report::{
-    Adapter, CascadeFigures, LayerFigures, Precision, Program, Report, Start, Timing, Weights,
-};
+pub use report::{Adapter, CascadeFigures, LayerFigures, Program, Report, Start, Timing, Weights};
 pub use roofline::Roofline;
 
 use statistics::{Sample, rounded};
@@ -75,14 +73,9 @@ pub enum BenchmarkError {
     /// The probe of the roofline failed.
     #[error("roofline probe: {0}")]
     Probe(GpuError),
-    /// The networks cannot be computed in this.
-    #[error("precision {precision}: {lacking}")]
-    Precision {
-        /// What was asked for.
-        precision: Precision,
-        /// What lacks it, and what there is.
-        lacking: String,
-    },
+    /// Plain Rust computes in f32 only.
+    #[error("precision {0}: plain Rust computes in f32 only")]
+    Precision(Precision),
     /// The networks do not run.
     #[error(transparent)]
     Locate(#[from] LocateError),
@@ -94,7 +87,7 @@ pub type Progress<'a> = &'a mut dyn FnMut(&str);
 /// Measures `model` on `device`.
 ///
 /// # Errors
-/// A precision that is not offered, a batch that the adapter cannot hold, any fault of the device.
+/// A batch that the adapter cannot hold, any fault of the device.
 pub fn on_gpu(
     device: &Device,
     model: &Model,
@@ -108,7 +101,7 @@ pub fn on_gpu(
 /// Measures `model` in plain Rust.
 ///
 /// # Errors
-/// A precision that is not offered.
+/// A precision other than f32.
 pub fn on_cpu(
     model: &Model,
     weights: Weights,
@@ -116,24 +109,6 @@ pub fn on_cpu(
     progress: Progress<'_>,
 ) -> Result<Report, BenchmarkError> {
     cpu::measure(model, weights, options, progress)
-}
-
-/// Whether networks can be computed in `precision`, on an adapter of `tier` or in plain Rust.
-fn offered(precision: Precision, tier: Option<Tier>) -> Result<(), BenchmarkError> {
-    let lacking = match (precision, tier) {
-        (Precision::F32, _) => return Ok(()),
-        (Precision::F16, None) => "plain Rust computes in f32 only",
-        (Precision::F16, Some(Tier::Baseline)) => {
-            "the adapter has no 16-bit floats in shaders; there is f32"
-        }
-        (Precision::F16, Some(_)) => {
-            "the engine has no 16-bit kernels yet, though the adapter could run them; there is f32"
-        }
-    };
-    Err(BenchmarkError::Precision {
-        precision,
-        lacking: lacking.to_owned(),
-    })
 }
 
 /// Columns and rows of the images that are searched: a common camera's.

@@ -3,7 +3,7 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use super::roofline::Roofline;
-use crate::gpu::{self, Device};
+use crate::gpu::{self, Device, Precision};
 use crate::network::Model;
 
 /// What was measured, where, and of what. Everything in an entry of [`Report::layers`] and
@@ -175,25 +175,6 @@ impl fmt::Display for Weights {
             "{}, family {}, {width} x {height} pixels, fingerprint {}",
             self.robot, self.family, self.fingerprint
         )
-    }
-}
-
-/// What the networks compute in.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Precision {
-    /// 32-bit floats.
-    F32,
-    /// 16-bit floats, summed in 32 bits.
-    F16,
-}
-
-impl fmt::Display for Precision {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            Self::F32 => "f32",
-            Self::F16 => "f16",
-        })
     }
 }
 

@@ -1,6 +1,7 @@
 use std::fmt;
 
-use super::report::{CascadeFigures, LayerFigures, Precision, Program, Report, Start};
+use super::report::{CascadeFigures, LayerFigures, Program, Report, Start};
+use crate::gpu::Precision;
 
 /// Columns side by side: names on the left, numbers on the right.
 pub(super) struct Table {

@@ -5,7 +5,7 @@ use image::RgbaImage;
 use super::view::View;
 use super::{Estimate, Joint, Mask, Status};
 use crate::camera::{Camera, Lens, Rectification};
-use crate::gpu::{Device, Frame, GpuError, Plan};
+use crate::gpu::{Device, Frame, GpuError, Plan, Precision};
 use crate::network::{Description, Model};
 use crate::reference;
 
@@ -76,12 +76,17 @@ pub enum LocateError {
 }
 
 impl Locator {
-    /// Plans `model` on `device`: allocates, compiles and binds everything that an image needs.
+    /// Plans `model` on `device`: allocates, compiles and binds everything that an image needs, with
+    /// activations in `precision`.
     ///
     /// # Errors
     /// A layer that exceeds the adapter's limits, or a driver's refusal.
-    pub fn on_gpu(device: Arc<Device>, model: &Model) -> Result<Self, LocateError> {
-        let plan = Box::new(Plan::new(&device, model, 1)?);
+    pub fn on_gpu(
+        device: Arc<Device>,
+        model: &Model,
+        precision: Precision,
+    ) -> Result<Self, LocateError> {
+        let plan = Box::new(Plan::new(&device, model, 1, precision)?);
         Ok(Self {
             engine: Engine::Gpu { device, plan },
             description: model.description.clone(),

@@ -8,16 +8,17 @@ use std::process::{ExitCode, Stdio};
 use std::time::Instant;
 
 use anyhow::{Context, anyhow, bail, ensure};
+use clap::CommandFactory;
 use clap::error::ErrorKind;
-use clap::{CommandFactory, ValueEnum};
 use image::RgbaImage;
 use indicatif::ProgressBar;
 
-use super::{locate, weights};
-use crate::benchmark::{self, Options, Precision, Report, Start, Weights, compare};
+use super::engine::{self, PrecisionName};
+use super::weights;
+use crate::benchmark::{self, Options, Report, Start, Weights, compare};
 use crate::camera::Camera;
 use crate::cascade::Output;
-use crate::gpu::AdapterRequest;
+use crate::gpu::Precision;
 use crate::network::Model;
 
 /// Measure how fast the networks run: layer by layer, and the whole cascade
@@ -30,12 +31,8 @@ pub struct Args {
     /// The model file to run [default: that of the UR5, where `locate` looks for it]
     #[arg(long, value_name = "FILE")]
     weights: Option<PathBuf>,
-    /// The adapter to run on (see `whereabot adapters`), or `cpu` for plain Rust
-    #[arg(long, value_name = "NAME|INDEX|cpu")]
-    adapter: Option<String>,
-    /// The backends to search: vulkan, metal, dx12, gl
-    #[arg(long, value_name = "NAME")]
-    backend: Option<String>,
+    #[command(flatten)]
+    engine: engine::EngineArgs,
     /// Numbers of images that are searched at once [default: 1,4,16]
     #[arg(long, value_name = "N,N,...", value_delimiter = ',',
           value_parser = clap::value_parser!(u32).range(1..))]
@@ -57,21 +54,6 @@ pub struct Args {
     /// Search one image, say so, and end: what a start costs
     #[arg(long, hide = true)]
     first_result: bool,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum PrecisionName {
-    F32,
-    F16,
-}
-
-impl From<PrecisionName> for Precision {
-    fn from(name: PrecisionName) -> Self {
-        match name {
-            PrecisionName::F32 => Self::F32,
-            PrecisionName::F16 => Self::F16,
-        }
-    }
 }
 
 /// Runs the command.
@@ -130,8 +112,9 @@ impl Args {
     fn refuse_measuring(&self) {
         let wanted = [
             ("--weights", self.weights.is_some()),
-            ("--adapter", self.adapter.is_some()),
-            ("--backend", self.backend.is_some()),
+            ("--adapter", self.engine.adapter.is_some()),
+            ("--backend", self.engine.backend.is_some()),
+            ("--no-tuning", self.engine.no_tuning),
             ("--batch", !self.batch.is_empty()),
             ("--precision", !self.precision.is_empty()),
             ("--frames", self.frames.is_some()),
@@ -145,10 +128,6 @@ impl Args {
                 .error(ErrorKind::ArgumentConflict, message)
                 .exit();
         }
-    }
-
-    fn request(&self) -> AdapterRequest {
-        AdapterRequest::new(self.adapter.as_deref(), self.backend.as_deref())
     }
 
     fn options(&self) -> Options {
@@ -197,12 +176,7 @@ fn ensure_new(file: &Path) -> anyhow::Result<()> {
 }
 
 fn measure(args: &Args) -> anyhow::Result<Report> {
-    let on_cpu = locate::is_cpu(args.adapter.as_deref());
-    let device = if on_cpu {
-        None
-    } else {
-        locate::open(&args.request())?
-    };
+    let device = args.engine.open()?;
     let file = weights::path(None, args.weights.as_deref())?;
     let bytes = fs::read(&file).with_context(|| format!("{}: cannot be read", file.display()))?;
     let model = Model::from_bytes(&bytes, &file)?;
@@ -218,6 +192,9 @@ fn measure(args: &Args) -> anyhow::Result<Report> {
         Some(device) => benchmark::on_gpu(device, &model, named, &options, &mut progress)?,
         None => benchmark::on_cpu(&model, named, &options, &mut progress)?,
     };
+    if let Some(device) = &device {
+        engine::remember(device);
+    }
     progress("the start of a process");
     match start(args, &file, device.is_some()) {
         Ok(start) => report.start = Some(start),
@@ -230,13 +207,9 @@ fn measure(args: &Args) -> anyhow::Result<Report> {
 
 /// What `--first-result` does: everything from an adapter to an answer.
 fn first_result(args: &Args) -> anyhow::Result<ExitCode> {
-    let device = if locate::is_cpu(args.adapter.as_deref()) {
-        None
-    } else {
-        locate::open(&args.request())?
-    };
+    let device = args.engine.open()?;
     let model = weights::load(None, args.weights.as_deref())?;
-    let mut locator = locate::locator(&model, device.as_ref())?;
+    let mut locator = engine::locator(&model, device.as_ref(), Precision::F32)?;
     let image = RgbaImage::new(640, 480);
     locator.locate(&image, &Camera::assumed(640, 480), Output::default())?;
     writeln!(io::stdout().lock(), "done")?;
@@ -275,10 +248,17 @@ fn time_to_first_result(args: &Args, weights: &Path, cache: &Path) -> anyhow::Re
     let mut command = std::process::Command::new(std::env::current_exe()?);
     command.args(["bench", "--first-result", "--weights"]);
     command.arg(weights);
-    for (flag, value) in [("--adapter", &args.adapter), ("--backend", &args.backend)] {
+    let engine = &args.engine;
+    for (flag, value) in [
+        ("--adapter", &engine.adapter),
+        ("--backend", &engine.backend),
+    ] {
         if let Some(value) = value {
             command.args([flag, value]);
         }
+    }
+    if engine.no_tuning {
+        command.arg("--no-tuning");
     }
     // Mesa's variables and NVIDIA's. Others have none.
     command

@@ -11,12 +11,13 @@ use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 
+use super::engine::{self, PrecisionName};
 use super::photo::{self, Photo};
 use super::weights;
 use crate::camera::{Camera, Intrinsics};
-use crate::cascade::{Estimate, Joint, LocateError, Locator, Output, Status};
+use crate::cascade::{Estimate, Joint, Locator, Output, Status};
 use crate::draw;
-use crate::gpu::{AdapterRequest, Device, GpuError};
+use crate::gpu::{Device, Precision};
 use crate::network::Model;
 
 /// Find the robot in images: which pixels it is, and where its joints are
@@ -55,12 +56,11 @@ pub struct Args {
     /// One line of JSON an image
     #[arg(long)]
     json: bool,
-    /// The adapter to run on (see `whereabot adapters`), or `cpu` for none
-    #[arg(long, value_name = "NAME|INDEX|cpu")]
-    adapter: Option<String>,
-    /// The backends to search: vulkan, metal, dx12, gl
-    #[arg(long, value_name = "NAME")]
-    backend: Option<String>,
+    /// What to store activations in; f16 is for GPUs
+    #[arg(long, value_enum, value_name = "NAME", default_value = "f32")]
+    precision: PrecisionName,
+    #[command(flatten)]
+    engine: engine::EngineArgs,
 }
 
 fn field_of_view(text: &str) -> Result<f64, String> {
@@ -136,23 +136,24 @@ pub(super) fn progress_bar(images: usize) -> ProgressBar {
 }
 
 /// The networks on what runs them.
-struct Engine {
+struct Engine<'a> {
     model: Model,
-    request: AdapterRequest,
+    args: &'a engine::EngineArgs,
+    precision: Precision,
     device: Option<Arc<Device>>,
     locator: Locator,
 }
 
-impl Engine {
-    fn new(args: &Args) -> anyhow::Result<Self> {
-        let on_cpu = is_cpu(args.adapter.as_deref());
-        let request = AdapterRequest::new(args.adapter.as_deref(), args.backend.as_deref());
-        let device = if on_cpu { None } else { open(&request)? };
+impl<'a> Engine<'a> {
+    fn new(args: &'a Args) -> anyhow::Result<Self> {
+        let device = args.engine.open()?;
         let model = weights::load(args.robot.as_deref(), args.weights.as_deref())?;
+        let precision = args.precision.into();
         Ok(Self {
-            locator: locator(&model, device.as_ref())?,
+            locator: engine::locator(&model, device.as_ref(), precision)?,
             model,
-            request,
+            args: &args.engine,
+            precision,
             device,
         })
     }
@@ -165,35 +166,10 @@ impl Engine {
     ) -> anyhow::Result<Estimate> {
         // A device with a fault stays at it: the next image gets another one.
         if self.device.as_ref().is_some_and(|d| d.check().is_err()) {
-            self.device = open(&self.request)?;
-            self.locator = locator(&self.model, self.device.as_ref())?;
+            self.device = self.args.open()?;
+            self.locator = engine::locator(&self.model, self.device.as_ref(), self.precision)?;
         }
         Ok(self.locator.locate(&photo.image, camera, output)?)
-    }
-}
-
-/// Whether `--adapter` asks for none.
-pub(super) fn is_cpu(adapter: Option<&str>) -> bool {
-    adapter.is_some_and(|name| name.eq_ignore_ascii_case("cpu"))
-}
-
-/// `None` where there is no adapter and none was asked for.
-pub(super) fn open(request: &AdapterRequest) -> Result<Option<Arc<Device>>, GpuError> {
-    match Device::open(request) {
-        Ok(device) => Ok(Some(Arc::new(device))),
-        Err(error @ GpuError::NoAdapter { .. }) if *request == AdapterRequest::default() => {
-            log::warn!("{error}: running on the CPU, which is slower");
-            Ok(None)
-        }
-        Err(error) => Err(error),
-    }
-}
-
-/// `model` on `device`, or in plain Rust.
-pub(super) fn locator(model: &Model, device: Option<&Arc<Device>>) -> Result<Locator, LocateError> {
-    match device {
-        Some(device) => Locator::on_gpu(Arc::clone(device), model),
-        None => Ok(Locator::on_cpu(model)),
     }
 }
 
@@ -235,7 +211,7 @@ struct Times {
 fn locate(
     args: &Args,
     calibrated: Option<Camera>,
-    engine: &mut Engine,
+    engine: &mut Engine<'_>,
     path: &Path,
     stems: &mut HashSet<String>,
 ) -> anyhow::Result<Located> {

@@ -2,6 +2,7 @@
 
 mod adapters;
 mod bench;
+mod engine;
 mod evaluate;
 mod info;
 mod locate;

@@ -105,7 +105,7 @@ impl AdapterReport {
         };
         Self {
             info: adapter.get_info(),
-            tier: Tier::of(adapter.features()),
+            tier: Tier::of(adapter),
             unusable,
         }
     }

@@ -1,8 +1,8 @@
 use std::fmt;
 
-use super::conv2d::{Conv2d, buffer, subgroup_one, texture};
+use super::conv2d::{Conv2d, Tiling, buffer, cooperative, subgroup_one, texture, tiled};
 use super::step::Step;
-use super::{Device, GpuError, Layout};
+use super::{Device, GpuError, Layout, Tier};
 
 /// A kernel for convolutions, named after its file in `shaders/`. None is best everywhere.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -13,24 +13,33 @@ pub enum Conv2dKernel {
     Subgroup,
     /// Between textures, without subgroups.
     Texture,
-    /// Between buffers.
+    /// Between buffers of halves, on a GPU's matrix units.
+    Cooperative,
+    /// Between buffers, through workgroup memory, so many pixels an invocation: for GPUs.
+    Tiled(usize),
+    /// Between buffers, on everything.
     Buffer,
 }
 
 impl Conv2dKernel {
     /// Every kernel, the better before the more general.
-    pub const ALL: [Self; 4] = [
+    pub const ALL: [Self; 8] = [
         Self::SubgroupOne,
         Self::Subgroup,
         Self::Texture,
+        Self::Cooperative,
+        Self::Tiled(8),
+        Self::Tiled(4),
+        Self::Tiled(2),
         Self::Buffer,
     ];
 
-    /// The layout that its tensors must have.
-    pub fn layout(self) -> Layout {
+    /// The layouts that its tensors can have.
+    pub fn layouts(self) -> &'static [Layout] {
         match self {
-            Self::SubgroupOne | Self::Subgroup | Self::Texture => Layout::Texture,
-            Self::Buffer => Layout::Buffer,
+            Self::SubgroupOne | Self::Subgroup | Self::Texture => &[Layout::Texture],
+            Self::Cooperative => &[Layout::HalfBuffer],
+            Self::Tiled(_) | Self::Buffer => &[Layout::Buffer, Layout::HalfBuffer],
         }
     }
 
@@ -38,7 +47,8 @@ impl Conv2dKernel {
     pub fn runs_on(self, device: &Device) -> bool {
         match self {
             Self::SubgroupOne | Self::Subgroup => device.subgroup_size().is_some_and(|n| n >= 8),
-            Self::Texture | Self::Buffer => true,
+            Self::Cooperative => device.tier() == Tier::CooperativeMatrix,
+            Self::Texture | Self::Tiled(_) | Self::Buffer => true,
         }
     }
 
@@ -46,45 +56,76 @@ impl Conv2dKernel {
     pub(super) fn serves(self, conv: &Conv2d<'_>) -> bool {
         let fits = match self {
             Self::SubgroupOne => {
-                conv.output.shape.channels == 1
-                    && conv.kernel <= 7
-                    && conv.input.margin() >= Some(conv.reach())
+                let reaches = conv.input.margin() >= Some(conv.reach());
+                reaches && conv.kernel <= 7 && conv.output.shape.channels == 1
             }
-            Self::Subgroup | Self::Texture | Self::Buffer => true,
+            _ => true,
         };
-        fits && self.layout() == conv.input.layout()
+        fits && self.layouts().contains(&conv.input.layout())
+    }
+
+    /// Whether it is the better choice where nothing was measured: tiles should be full, and workgroups
+    /// enough for a large GPU.
+    fn suits(self, conv: &Conv2d<'_>) -> bool {
+        let (input, output) = (conv.input.shape, conv.output.shape);
+        match self {
+            Self::Cooperative => input.channels.min(output.channels) >= 16,
+            Self::Tiled(pixels) => pixels == 2 || Tiling::new(conv, pixels).workgroups() >= 256,
+            _ => true,
+        }
     }
 }
 
 impl fmt::Display for Conv2dKernel {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::SubgroupOne => "conv2d_subgroup_one",
-            Self::Subgroup => "conv2d_subgroup",
-            Self::Texture => "conv2d_texture",
-            Self::Buffer => "conv2d_buffer",
-        })
+        match self {
+            Self::SubgroupOne => f.write_str("conv2d_subgroup_one"),
+            Self::Subgroup => f.write_str("conv2d_subgroup"),
+            Self::Texture => f.write_str("conv2d_texture"),
+            Self::Cooperative => f.write_str("conv2d_cooperative"),
+            Self::Tiled(pixels) => write!(f, "conv2d_tiled/{pixels}"),
+            Self::Buffer => f.write_str("conv2d_buffer"),
+        }
     }
 }
 
-/// Plans a convolution with the first kernel that can make it; `only` that one, if given.
+/// Plans a convolution: by `only`, if it is given, or by what the device's tuner finds to be the fastest,
+/// or else by the first kernel that suits.
 pub(super) fn conv2d(
     device: &Device,
     conv: &Conv2d<'_>,
     only: Option<Conv2dKernel>,
 ) -> Result<Step, GpuError> {
-    let kernel = Conv2dKernel::ALL
-        .into_iter()
-        .filter(|kernel| only.is_none_or(|only| only == *kernel))
-        .find(|kernel| kernel.runs_on(device) && kernel.serves(conv));
-    match kernel {
-        Some(Conv2dKernel::SubgroupOne) => subgroup_one(device, conv),
-        Some(Conv2dKernel::Subgroup) => texture(device, conv, true),
-        Some(Conv2dKernel::Texture) => texture(device, conv, false),
-        Some(Conv2dKernel::Buffer) => buffer(device, conv),
+    let mut candidates = Conv2dKernel::ALL.to_vec();
+    candidates.retain(|kernel| kernel.runs_on(device) && kernel.serves(conv));
+    let chosen = match only {
+        Some(only) => candidates.contains(&only).then_some(only),
+        None => match device.tuner().choose(device, conv, &candidates)? {
+            Some(fastest) => Some(fastest),
+            None => candidates.into_iter().find(|kernel| kernel.suits(conv)),
+        },
+    };
+    match chosen {
+        Some(kernel) => by(kernel, device, conv),
         None => Err(GpuError::Kernel {
             layer: conv.label.to_owned(),
             wanted: only.map_or("conv2d".into(), |only| only.to_string()),
         }),
+    }
+}
+
+/// A convolution by a `kernel` that serves it.
+pub(super) fn by(
+    kernel: Conv2dKernel,
+    device: &Device,
+    conv: &Conv2d<'_>,
+) -> Result<Step, GpuError> {
+    match kernel {
+        Conv2dKernel::SubgroupOne => subgroup_one(device, conv),
+        Conv2dKernel::Subgroup => texture(device, conv, true),
+        Conv2dKernel::Texture => texture(device, conv, false),
+        Conv2dKernel::Cooperative => cooperative(device, conv),
+        Conv2dKernel::Tiled(pixels) => tiled(device, conv, pixels),
+        Conv2dKernel::Buffer => buffer(device, conv),
     }
 }

@@ -4,7 +4,8 @@ use std::sync::{Arc, Mutex, PoisonError, mpsc};
 use std::time::Duration;
 
 use super::adapter::{self, AdapterRequest, Choice};
-use super::{GpuError, Layout, Tier};
+use super::tuner::Tuner;
+use super::{GpuError, Layout, Precision, Tier};
 
 /// A wgpu device and queue of our own, whose errors come back as values.
 ///
@@ -15,6 +16,8 @@ pub struct Device {
     queue: wgpu::Queue,
     info: wgpu::AdapterInfo,
     tier: Tier,
+    halves: bool,
+    tuner: Tuner,
     choice: Choice,
     fault: Arc<Mutex<Option<GpuError>>>,
     pipelines: Mutex<HashMap<PipelineKey, wgpu::ComputePipeline>>,
@@ -39,9 +42,13 @@ impl Device {
     /// every kernel, which takes seconds.
     pub const TIMEOUT: Duration = Duration::from_secs(60);
 
+    /// What commands spend on [`Device::tuned`].
+    pub const TUNING: Duration = Duration::from_secs(2);
+
     /// What is asked for where the adapter has it.
-    const FEATURES: wgpu::Features =
-        wgpu::Features::SUBGROUP.union(wgpu::Features::TIMESTAMP_QUERY);
+    const FEATURES: wgpu::Features = wgpu::Features::SUBGROUP
+        .union(wgpu::Features::TIMESTAMP_QUERY)
+        .union(wgpu::Features::SHADER_F16);
 
     /// Opens the adapter that `request` leads to.
     ///
@@ -50,9 +57,22 @@ impl Device {
     pub fn open(request: &AdapterRequest) -> Result<Self, GpuError> {
         let (instance, adapter, choice) = adapter::open(request)?;
         let info = adapter.get_info();
+        let tier = Tier::of(&adapter);
+        let mut features = adapter.features() & Self::FEATURES;
+        let mut experimental = wgpu::ExperimentalFeatures::disabled();
+        if tier == Tier::CooperativeMatrix {
+            features |= wgpu::Features::EXPERIMENTAL_COOPERATIVE_MATRIX;
+            // SAFETY: this says that wgpu may have bugs in what is experimental. A kernel that uses it is
+            // chosen only where its answers were found to be right.
+            #[allow(unsafe_code)]
+            {
+                experimental = unsafe { wgpu::ExperimentalFeatures::enabled() };
+            }
+        }
         let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("whereabot"),
-            required_features: adapter.features() & Self::FEATURES,
+            required_features: features,
+            experimental_features: experimental,
             required_limits: adapter.limits(),
             ..Default::default()
         }))
@@ -78,7 +98,12 @@ impl Device {
             lost(GpuError::Lost(format!("{reason:?}: {message}")));
         });
         Ok(Self {
-            tier: Tier::of(adapter.features()),
+            tier,
+            halves: adapter
+                .get_downlevel_capabilities()
+                .flags
+                .contains(wgpu::DownlevelFlags::SHADER_F16_IN_F32),
+            tuner: Tuner::default(),
             device,
             queue,
             info,
@@ -109,9 +134,18 @@ impl Device {
         self.tier
     }
 
-    /// How tensors lie in its memory, unless asked otherwise.
-    pub fn layout(&self) -> Layout {
-        Layout::of(&self.info)
+    /// How tensors of `precision` lie in its memory.
+    ///
+    /// # Errors
+    /// [`GpuError::Precision`] where it cannot store 16-bit floats.
+    pub fn layout(&self, precision: Precision) -> Result<Layout, GpuError> {
+        match precision {
+            Precision::F16 if !self.halves => Err(GpuError::Precision {
+                adapter: self.info.name.clone(),
+            }),
+            Precision::F16 => Ok(Layout::HalfBuffer),
+            Precision::F32 => Ok(Layout::of(&self.info)),
+        }
     }
 
     /// Invocations in its smallest subgroups; `None` where kernels cannot use subgroups.
@@ -123,6 +157,25 @@ impl Device {
     /// Why this adapter was chosen.
     pub fn choice(&self) -> &Choice {
         &self.choice
+    }
+
+    /// Lets plans find the fastest kernels for their layers by timing them, which takes `limit` at most,
+    /// all plans together. `memory` is what [`Device::tuning`] gave in an earlier process; what is of
+    /// another adapter, driver or version of this library, or no such thing at all, is passed over.
+    #[must_use]
+    pub fn tuned(mut self, limit: Duration, memory: &[u8]) -> Self {
+        self.tuner = Tuner::new(limit, &self.info, memory);
+        self
+    }
+
+    /// What was found to be the fastest, to be remembered for [`Device::tuned`]; `None` where nothing new
+    /// was found since the last call.
+    pub fn tuning(&self) -> Option<Vec<u8>> {
+        self.tuner.memory(&self.info)
+    }
+
+    pub(super) fn tuner(&self) -> &Tuner {
+        &self.tuner
     }
 
     /// The pipeline of a kernel, made once for each text and set of constants: compiling is dear, and

@@ -54,6 +54,12 @@ pub enum GpuError {
         /// The adapter's name.
         adapter: String,
     },
+    /// The adapter's kernels cannot read and write 16-bit floats.
+    #[error("adapter `{adapter}` cannot store activations in f16; there is f32")]
+    Precision {
+        /// The adapter's name.
+        adapter: String,
+    },
     /// A network that cannot be planned.
     #[error("{0}")]
     Network(Arc<NetworkError>),

@@ -5,11 +5,16 @@ use super::Layout;
 /// The whole WGSL of a kernel: the access to tensors in `layout`, if it uses that, then `sizes` as
 /// constants, then its own `source`. Loops from zero to a sum of `sizes` are written out.
 pub fn kernel_text(layout: Option<Layout>, sizes: &[(&str, usize)], source: &str) -> String {
-    let mut text = String::new();
+    // Directives stand before all else.
+    let (directives, source): (Vec<&str>, Vec<&str>) = source
+        .split_inclusive('\n')
+        .partition(|line| line.starts_with("enable "));
+    let (mut text, source) = (directives.concat(), source.concat());
     if let Some(layout) = layout {
         text.push_str(include_str!("../../shaders/layout/geometry.wgsl"));
         text.push_str(match layout {
             Layout::Buffer => include_str!("../../shaders/layout/buffer.wgsl"),
+            Layout::HalfBuffer => include_str!("../../shaders/layout/half_buffer.wgsl"),
             Layout::Texture => include_str!("../../shaders/layout/texture.wgsl"),
         });
     }
@@ -17,7 +22,7 @@ pub fn kernel_text(layout: Option<Layout>, sizes: &[(&str, usize)], source: &str
         // Writing to a string does not fail.
         let _ = writeln!(text, "const {name} = {value}u;");
     }
-    write_out_loops(&mut text, source, sizes);
+    write_out_loops(&mut text, &source, sizes);
     text
 }
 

@@ -22,6 +22,7 @@ mod soft_argmax2d;
 mod step;
 mod tensor;
 mod tier;
+mod tuner;
 mod upsample2d;
 
 pub use adapter::{
@@ -32,7 +33,7 @@ pub use coverage::{Totals, coverage};
 pub use device::Device;
 pub use error::GpuError;
 pub use kernel_text::kernel_text;
-pub use layout::Layout;
+pub use layout::{Layout, Precision};
 pub use network::NetworkPlan;
 pub use overlay::overlay;
 pub use plan::{Frame, Plan};

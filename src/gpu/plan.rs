@@ -5,7 +5,7 @@ use super::overlay::overlay;
 use super::rectify::Rectify;
 use super::step::Step;
 use super::tensor::{Tensor, staging_buffer, storage_buffer};
-use super::{Device, GpuError, NetworkPlan};
+use super::{Device, GpuError, NetworkPlan, Precision};
 use crate::camera::Rectification;
 use crate::network::{Coverage, Model};
 
@@ -37,13 +37,18 @@ pub struct Frame {
 }
 
 impl Plan {
-    /// Plans `model` for `batch` images a frame.
+    /// Plans `model` for `batch` images a frame, with activations in `precision`.
     ///
     /// # Errors
     /// A layer that exceeds the adapter's limits, or a driver's refusal.
-    pub fn new(device: &Device, model: &Model, batch: usize) -> Result<Self, GpuError> {
+    pub fn new(
+        device: &Device,
+        model: &Model,
+        batch: usize,
+        precision: Precision,
+    ) -> Result<Self, GpuError> {
         let description = &model.description;
-        let layout = device.layout();
+        let layout = device.layout(precision)?;
         device.scoped(|| {
             let image = NetworkPlan::input(device, layout, "image", &model.mask_network, batch)?;
             let rectify = (0..batch)

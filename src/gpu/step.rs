@@ -115,6 +115,7 @@ impl<'a> Tensors<'a> {
                 ("HEIGHT", tensor.shape.height),
                 ("WIDTH", tensor.shape.width),
                 ("MARGIN", tensor.margin().unwrap_or(0)),
+                ("FULL", tensor.is_full().into()),
             ];
             constants.extend(values.map(|(what, v)| (format!("{name}_{what}"), v as f64)));
         }

@@ -1,3 +1,5 @@
+use half::f16;
+
 use super::{Device, GpuError, Layout};
 use crate::network::Shape;
 
@@ -19,6 +21,9 @@ enum Memory {
         buffer: wgpu::Buffer,
         /// Where it begins, in bytes.
         offset: u64,
+        layout: Layout,
+        /// Of 32-bit floats, whatever the layout.
+        full: bool,
     },
     Texture {
         texture: wgpu::Texture,
@@ -34,17 +39,22 @@ pub fn blocks(channels: usize) -> usize {
     channels.div_ceil(4)
 }
 
-/// Bytes of a texel.
+/// Bytes of a texel of 32-bit floats.
 const TEXEL: usize = 16;
 
+/// Bytes of a texel.
+fn texel_size(full: bool) -> usize {
+    if full { TEXEL } else { TEXEL / 2 }
+}
+
 impl Tensor {
-    /// Allocates a tensor, zeroed, in the device's layout and without a margin. `what` names it in
+    /// Allocates a tensor, zeroed, in the device's layout for `f32` and without a margin. `what` names it in
     /// errors. What a network reads wants a margin: [`NetworkPlan::input`](super::NetworkPlan::input).
     ///
     /// # Errors
     /// [`GpuError::Limit`] where the adapter's buffers or textures are too small.
     pub fn new(device: &Device, what: &str, shape: Shape, batch: usize) -> Result<Self, GpuError> {
-        Self::in_layout(device, device.layout(), what, shape, batch, 0)
+        Self::in_layout(device, Layout::of(device.info()), what, shape, batch, 0)
     }
 
     /// Allocates a tensor, zeroed, in `layout`. Its readers may reach `margin` texels beyond its
@@ -62,11 +72,15 @@ impl Tensor {
     ) -> Result<Self, GpuError> {
         let planes = blocks(shape.channels) * batch;
         let memory = match layout {
-            Layout::Buffer => {
+            Layout::Buffer | Layout::HalfBuffer => {
                 let texels = planes as u64 * (shape.height * shape.width) as u64;
+                let full = layout == Layout::Buffer || shape.height * shape.width == 1;
+                let bytes = texels * texel_size(full) as u64;
                 Memory::Buffer {
-                    buffer: storage_buffer(device, what, TEXEL as u64 * texels)?,
+                    buffer: storage_buffer(device, what, bytes)?,
                     offset: 0,
+                    layout,
+                    full,
                 }
             }
             Layout::Texture => {
@@ -97,15 +111,23 @@ impl Tensor {
         let first_plane = first / 4 * self.batch;
         let planes = blocks(channels) * self.batch;
         let memory = match &self.memory {
-            Memory::Buffer { buffer, offset } => {
+            Memory::Buffer {
+                buffer,
+                offset,
+                layout,
+                full,
+            } => {
                 let alignment = device.wgpu().limits().min_storage_buffer_offset_alignment;
-                let offset = offset + (TEXEL * first_plane * shape.height * shape.width) as u64;
+                let before = first_plane * shape.height * shape.width;
+                let offset = offset + (self.texel_size() * before) as u64;
                 if !offset.is_multiple_of(alignment.into()) {
                     return None;
                 }
                 Memory::Buffer {
                     buffer: buffer.clone(),
                     offset,
+                    layout: *layout,
+                    full: *full,
                 }
             }
             Memory::Texture {
@@ -133,7 +155,7 @@ impl Tensor {
     /// How it lies in memory.
     pub fn layout(&self) -> Layout {
         match self.memory {
-            Memory::Buffer { .. } => Layout::Buffer,
+            Memory::Buffer { layout, .. } => layout,
             Memory::Texture { .. } => Layout::Texture,
         }
     }
@@ -160,11 +182,11 @@ impl Tensor {
     /// What a kernel binds.
     pub(super) fn resource(&self) -> wgpu::BindingResource<'_> {
         match &self.memory {
-            Memory::Buffer { buffer, offset } => {
+            Memory::Buffer { buffer, offset, .. } => {
                 wgpu::BindingResource::Buffer(wgpu::BufferBinding {
                     buffer,
                     offset: *offset,
-                    size: wgpu::BufferSize::new((TEXEL * self.texels()) as u64),
+                    size: wgpu::BufferSize::new((self.texel_size() * self.texels()) as u64),
                 })
             }
             Memory::Texture { view, .. } => wgpu::BindingResource::TextureView(view),
@@ -173,7 +195,19 @@ impl Tensor {
 
     /// Bytes of the values of the whole batch, without unused lanes.
     pub fn bytes(&self) -> u64 {
-        4 * (self.batch * self.shape.len()) as u64
+        (self.texel_size() / 4 * self.batch * self.shape.len()) as u64
+    }
+
+    /// Whether it is of 32-bit floats.
+    pub(super) fn is_full(&self) -> bool {
+        match self.memory {
+            Memory::Buffer { full, .. } => full,
+            Memory::Texture { .. } => true,
+        }
+    }
+
+    fn texel_size(&self) -> usize {
+        texel_size(self.is_full())
     }
 
     /// Writes `[image][channel][row][column]` values at the queue's next submission.
@@ -190,9 +224,15 @@ impl Tensor {
             });
         }
         let packed = pack(values, self.shape, self.batch);
-        let bytes: &[u8] = bytemuck::cast_slice(&packed);
+        let halves: Vec<f16>;
+        let bytes: &[u8] = if self.is_full() {
+            bytemuck::cast_slice(&packed)
+        } else {
+            halves = packed.into_iter().map(f16::from_f32).collect();
+            bytemuck::cast_slice(&halves)
+        };
         match &self.memory {
-            Memory::Buffer { buffer, offset } => {
+            Memory::Buffer { buffer, offset, .. } => {
                 device.queue().write_buffer(buffer, *offset, bytes);
             }
             Memory::Texture { texture, .. } => device.queue().write_texture(
@@ -207,6 +247,59 @@ impl Tensor {
             ),
         }
         Ok(())
+    }
+
+    /// Writes numbers in [-1, 1), some of which repeat, at the queue's next submission. For buffers.
+    pub(super) fn fill(&self, device: &Device) {
+        let Memory::Buffer { buffer, offset, .. } = &self.memory else {
+            return;
+        };
+        // A prime number of texels: not every row or plane begins with the same.
+        let numbers = (0..4 * 16_381_u32).map(|i| i.wrapping_mul(2_654_435_761) as i32 as f32);
+        let numbers = numbers.map(|number| number / (1_u32 << 31) as f32);
+        let bytes: Vec<u8> = if self.is_full() {
+            numbers.flat_map(f32::to_le_bytes).collect()
+        } else {
+            numbers
+                .flat_map(|v| f16::from_f32(v).to_le_bytes())
+                .collect()
+        };
+        let end = offset + (self.texel_size() * self.texels()) as u64;
+        for at in (*offset..end).step_by(bytes.len()) {
+            let rest = (end - at).min(bytes.len() as u64) as usize;
+            let piece = bytes.get(..rest).unwrap_or_default();
+            device.queue().write_buffer(buffer, at, piece);
+        }
+    }
+
+    /// Numbers from all over it, as they lie in memory. For buffers. Waits for what was submitted before.
+    pub(super) fn sample(&self, device: &Device) -> Result<Vec<f32>, GpuError> {
+        const PIECES: u64 = 64;
+        const PIECE: u64 = 1 << 14;
+        let Memory::Buffer { buffer, offset, .. } = &self.memory else {
+            return Ok(Vec::new());
+        };
+        let size = (self.texel_size() * self.texels()) as u64;
+        let (pieces, piece) = if size <= PIECES * PIECE {
+            (1, size)
+        } else {
+            (PIECES, PIECE)
+        };
+        let staging = staging_buffer(device, pieces * piece);
+        let mut encoder = device.wgpu().create_command_encoder(&Default::default());
+        for number in 0..pieces {
+            let at = (size - piece) * number / pieces.max(2) / 16 * 16;
+            encoder.copy_buffer_to_buffer(buffer, offset + at, &staging, number * piece, piece);
+        }
+        device.queue().submit([encoder.finish()]);
+        device.read(&staging, |bytes| {
+            if self.is_full() {
+                bytemuck::pod_collect_to_vec(bytes)
+            } else {
+                let halves: Vec<f16> = bytemuck::pod_collect_to_vec(bytes);
+                halves.into_iter().map(f16::to_f32).collect()
+            }
+        })
     }
 
     /// Reads `[image][channel][row][column]` values back. Waits for what was submitted before.
@@ -237,6 +330,7 @@ impl Tensor {
             Memory::Buffer {
                 buffer,
                 offset: from,
+                ..
             } => {
                 let size = self.staging_size();
                 encoder.copy_buffer_to_buffer(buffer, *from, staging, offset, size);
@@ -258,19 +352,25 @@ impl Tensor {
 
     /// `[image][channel][row][column]` values of what [`Self::copy_to`] wrote.
     pub(super) fn values(&self, bytes: &[u8]) -> Vec<f32> {
-        let row = TEXEL * self.shape.width;
-        let packed: Vec<f32> = bytes
+        let row = self.texel_size() * self.shape.width;
+        let rows = bytes
             .chunks_exact(self.staging_row())
             .take(self.planes() * self.shape.height)
-            .filter_map(|padded| padded.get(..row))
-            .flat_map(bytemuck::pod_collect_to_vec::<u8, f32>)
-            .collect();
+            .filter_map(|padded| padded.get(..row));
+        let packed: Vec<f32> = if self.is_full() {
+            rows.flat_map(bytemuck::pod_collect_to_vec::<u8, f32>)
+                .collect()
+        } else {
+            rows.flat_map(bytemuck::pod_collect_to_vec::<u8, f16>)
+                .map(f16::to_f32)
+                .collect()
+        };
         unpack(&packed, self.shape, self.batch)
     }
 
     /// Bytes of a row in a staging buffer.
     fn staging_row(&self) -> usize {
-        let row = TEXEL * self.shape.width;
+        let row = self.texel_size() * self.shape.width;
         match self.memory {
             Memory::Buffer { .. } => row,
             Memory::Texture { .. } => {

@@ -14,19 +14,34 @@ pub enum Tier {
 }
 
 impl Tier {
-    /// The tier that these features reach.
-    pub fn of(features: wgpu::Features) -> Self {
+    /// The tier that an adapter reaches.
+    pub fn of(adapter: &wgpu::Adapter) -> Self {
         use wgpu::Features as F;
+        let features = adapter.features();
         if !features.contains(F::SHADER_F16) {
             Self::Baseline
         } else if !features.contains(F::SUBGROUP) {
             Self::F16
-        } else if !features.contains(F::EXPERIMENTAL_COOPERATIVE_MATRIX) {
+        } else if !features.contains(F::EXPERIMENTAL_COOPERATIVE_MATRIX) || !matrices(adapter) {
             Self::Subgroups
         } else {
             Self::CooperativeMatrix
         }
     }
+}
+
+/// Whether it multiplies 16 x 16 halves and sums them in 32 bits, in subgroups of 32, with the workgroup
+/// memory that `conv2d_matrix` takes.
+fn matrices(adapter: &wgpu::Adapter) -> bool {
+    use wgpu::CooperativeScalarType::{F16, F32};
+    let info = adapter.get_info();
+    let sizes = [info.subgroup_min_size, info.subgroup_max_size];
+    let fits = adapter.limits().max_compute_workgroup_storage_size >= 32 << 10;
+    let mut configurations = adapter.cooperative_matrix_properties().into_iter();
+    fits && sizes == [32, 32]
+        && configurations.any(|c| {
+            [c.m_size, c.n_size, c.k_size] == [16; 3] && (c.ab_type, c.cr_type) == (F16, F32)
+        })
 }
 
 impl fmt::Display for Tier {

@@ -10,7 +10,7 @@
 use std::sync::{Arc, OnceLock};
 
 use whereabot::cascade::Estimate;
-use whereabot::gpu::{AdapterRequest, Conv2dKernel, Device, Layout, NetworkPlan};
+use whereabot::gpu::{AdapterRequest, Conv2dKernel, Device, Layout, NetworkPlan, Precision};
 use whereabot::network::{Layer, Network, Operation, Parameters, Shape};
 use whereabot::reference;
 
@@ -79,9 +79,21 @@ pub fn network(layers: Vec<Layer>, input: Shape, seed: u64) -> Network {
     .unwrap()
 }
 
+/// The nearest values that 16-bit floats can hold.
+pub fn in_halves(values: &[f32]) -> Vec<f32> {
+    let halves = values.iter().map(|v| half::f16::from_f32(*v).to_f32());
+    halves.collect()
+}
+
 /// What the GPU makes of a batch `[image][channel][row][column]`, in the layout that suits it.
 pub fn on_gpu(network: &Network, batch: usize, values: &[f32]) -> Vec<f32> {
-    on_gpu_by(device().layout(), None, network, batch, values)
+    on_gpu_by(
+        device().layout(Precision::F32).unwrap(),
+        None,
+        network,
+        batch,
+        values,
+    )
 }
 
 /// What the GPU makes of it in `layout`, all convolutions by one `kernel`, if it is given.
@@ -159,7 +171,7 @@ pub fn check_in_buffers(network: &Network, seed: u64, tolerance: f32) {
 }
 
 /// Holds the GPU's network to the reference, in `layout`, all convolutions by one `kernel`, if it is
-/// given.
+/// given. In halves, the input can be held, and the output is rounded.
 pub fn check_network_by(
     layout: Layout,
     kernel: Option<Conv2dKernel>,
@@ -169,9 +181,19 @@ pub fn check_network_by(
     tolerance: f32,
 ) {
     let input = network.input();
-    let values = noise(batch * input.len(), seed + 2);
+    let mut values = noise(batch * input.len(), seed + 2);
+    if layout == Layout::HalfBuffer {
+        values = in_halves(&values);
+    }
     let gpu = on_gpu_by(layout, kernel, network, batch, &values);
     let expected = on_reference(network, &values);
+    let greatest = expected.iter().fold(0.0_f32, |most, v| most.max(v.abs()));
+    let rounding = if layout == Layout::HalfBuffer {
+        greatest / 512.0
+    } else {
+        0.0
+    };
+    let tolerance = tolerance + rounding;
     let found = difference(&gpu, &expected).unwrap();
     let last = &network.nodes().last().unwrap().layer;
     assert!(

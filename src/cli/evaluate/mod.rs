@@ -13,11 +13,11 @@ use image::{GrayImage, RgbaImage};
 use indicatif::ProgressBar;
 use serde::Serialize;
 
+use super::engine::{self, PrecisionName};
 use super::{locate, photo};
 use crate::camera::{Camera, Distortion};
 use crate::cascade::{Locator, Output, Status};
 use crate::evaluation::{Annotation, PhotoScore, Score, read_annotations};
-use crate::gpu::AdapterRequest;
 use crate::network::Model;
 use crate::recording::{Reader, Sample};
 use report::Report;
@@ -57,12 +57,11 @@ pub struct Args {
     /// One JSON object instead of tables
     #[arg(long)]
     json: bool,
-    /// The adapter to run on (see `whereabot adapters`), or `cpu` for none
-    #[arg(long, value_name = "NAME|INDEX|cpu")]
-    adapter: Option<String>,
-    /// The backends to search: vulkan, metal, dx12, gl
-    #[arg(long, value_name = "NAME")]
-    backend: Option<String>,
+    /// What to store activations in; f16 is for GPUs
+    #[arg(long, value_enum, value_name = "NAME", default_value = "f32")]
+    precision: PrecisionName,
+    #[command(flatten)]
+    engine: engine::EngineArgs,
 }
 
 /// Which samples of a recording.
@@ -233,21 +232,14 @@ fn prepare(folder: &Path, force: bool) -> anyhow::Result<()> {
 }
 
 fn load(args: &Args) -> anyhow::Result<Vec<Judged>> {
-    let device = if locate::is_cpu(args.adapter.as_deref()) {
-        None
-    } else {
-        locate::open(&AdapterRequest::new(
-            args.adapter.as_deref(),
-            args.backend.as_deref(),
-        ))?
-    };
+    let device = args.engine.open()?;
     args.weights
         .iter()
         .map(|file| {
             let model = Model::load(file)?;
             Ok(Judged {
                 file: file.clone(),
-                locator: locate::locator(&model, device.as_ref())?,
+                locator: engine::locator(&model, device.as_ref(), args.precision.into())?,
                 model,
             })
         })

@@ -20,7 +20,11 @@ pub fn buffer(device: &Device, conv: &Conv2d<'_>) -> Result<Step, GpuError> {
         matrix * 16 + i % 4 * 4 + o % 4
     });
     let weights = constant_buffer(device, &format!("{label}: weight"), &weights)?;
-    let bias = constant_buffer(device, &format!("{label}: bias"), &conv.padded_bias())?;
+    let bias = constant_buffer(
+        device,
+        &format!("{label}: bias"),
+        &conv.padded_bias(out_blocks),
+    )?;
     let tiles = output.shape.width.div_ceil(COLUMNS);
     let invocations = output.batch * out_blocks.div_ceil(2) * output.shape.height * tiles;
     Step::new(

@@ -2,12 +2,16 @@
 //! weights for it. [`super::choice`] says which one serves a layer.
 
 mod buffer;
+mod cooperative;
 mod subgroup_one;
 mod texture;
+mod tiled;
 
 pub(super) use buffer::buffer;
+pub(super) use cooperative::cooperative;
 pub(super) use subgroup_one::subgroup_one;
 pub(super) use texture::texture;
+pub(super) use tiled::{Tiling, tiled};
 
 use super::step::{Step, StepDescriptor, Tensors, Work, activation_number};
 use super::tensor::{Tensor, blocks, constant_buffer, uniform_buffer};
@@ -58,10 +62,21 @@ impl Conv2d<'_> {
         packed
     }
 
-    /// The biases, filled up with zeros to full pairs of blocks.
-    fn padded_bias(&self) -> Vec<f32> {
+    /// The weights as `[row][column][in block][out block]` of 4 x 4 matrices, a column of four outputs for
+    /// each input, filled up with zeros to so many blocks.
+    fn packed_matrices(&self, in_blocks: usize, out_blocks: usize) -> Vec<f32> {
+        let taps = self.kernel * self.kernel;
+        self.packed(taps * in_blocks * out_blocks * 16, |[o, i, row, column]| {
+            let tap = row * self.kernel + column;
+            let matrix = (tap * in_blocks + i / 4) * out_blocks + o / 4;
+            matrix * 16 + i % 4 * 4 + o % 4
+        })
+    }
+
+    /// The biases, filled up with zeros to so many blocks.
+    fn padded_bias(&self, blocks: usize) -> Vec<f32> {
         let mut padded = self.parameters.bias.clone();
-        padded.resize(blocks(padded.len()).next_multiple_of(2) * 4, 0.0);
+        padded.resize(4 * blocks, 0.0);
         padded
     }
 }
@@ -116,7 +131,8 @@ fn lattice(
         0,
     ];
     let layer = uniform_buffer(device, &format!("{label}: layer"), &layer);
-    let bias = constant_buffer(device, &format!("{label}: bias"), &conv.padded_bias())?;
+    let pairs = blocks(output.shape.channels).next_multiple_of(2);
+    let bias = constant_buffer(device, &format!("{label}: bias"), &conv.padded_bias(pairs))?;
     Step::new(
         device,
         &StepDescriptor {

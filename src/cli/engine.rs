@@ -1,0 +1,115 @@
+//! What runs the networks: the flags that commands share.
+
+use std::fs;
+use std::io;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use anyhow::ensure;
+use clap::ValueEnum;
+
+use crate::cascade::Locator;
+use crate::gpu::{AdapterRequest, Device, GpuError, Precision};
+use crate::network::Model;
+
+#[derive(Debug, clap::Args)]
+pub(super) struct EngineArgs {
+    /// The adapter to run on (see `whereabot adapters`), or `cpu` for plain Rust
+    #[arg(long, value_name = "NAME|INDEX|cpu")]
+    pub adapter: Option<String>,
+    /// The backends to search: vulkan, metal, dx12, gl
+    #[arg(long, value_name = "NAME")]
+    pub backend: Option<String>,
+    /// Do not look for the fastest kernels on this adapter, which takes two seconds at most and is
+    /// remembered in the user's cache folder
+    #[arg(long)]
+    pub no_tuning: bool,
+}
+
+impl EngineArgs {
+    /// Whether no adapter is asked for.
+    pub fn is_cpu(&self) -> bool {
+        let cpu = |name: &String| name.eq_ignore_ascii_case("cpu");
+        self.adapter.as_ref().is_some_and(cpu)
+    }
+
+    /// `None` for plain Rust: asked for, or there is no adapter and none was asked for.
+    pub fn open(&self) -> Result<Option<Arc<Device>>, GpuError> {
+        if self.is_cpu() {
+            return Ok(None);
+        }
+        let request = AdapterRequest::new(self.adapter.as_deref(), self.backend.as_deref());
+        match Device::open(&request) {
+            Ok(device) if self.no_tuning => Ok(Some(Arc::new(device))),
+            Ok(device) => {
+                let memory = tuning_file(&device).and_then(|file| fs::read(file).ok());
+                let device = device.tuned(Device::TUNING, &memory.unwrap_or_default());
+                Ok(Some(Arc::new(device)))
+            }
+            Err(error @ GpuError::NoAdapter { .. }) if request == AdapterRequest::default() => {
+                log::warn!("{error}: running on the CPU, which is slower");
+                Ok(None)
+            }
+            Err(error) => Err(error),
+        }
+    }
+}
+
+/// `model` on `device`, or in plain Rust.
+pub(super) fn locator(
+    model: &Model,
+    device: Option<&Arc<Device>>,
+    precision: Precision,
+) -> anyhow::Result<Locator> {
+    let Some(device) = device else {
+        ensure!(
+            precision == Precision::F32,
+            "plain Rust computes in f32 only"
+        );
+        return Ok(Locator::on_cpu(model));
+    };
+    let locator = Locator::on_gpu(Arc::clone(device), model, precision)?;
+    remember(device);
+    Ok(locator)
+}
+
+/// Keeps what was found about an adapter, if there is anything new.
+pub(super) fn remember(device: &Device) {
+    let Some((file, tuning)) = tuning_file(device).zip(device.tuning()) else {
+        return;
+    };
+    let write = || -> io::Result<()> {
+        fs::create_dir_all(file.parent().unwrap_or(&file))?;
+        // Another process may be reading it.
+        let new = file.with_extension(format!("{}.new", std::process::id()));
+        fs::write(&new, &tuning)?;
+        fs::rename(&new, &file)
+    };
+    if let Err(error) = write() {
+        log::warn!("{}: cannot be written: {error}", file.display());
+    }
+}
+
+/// Where what was found about an adapter is kept; `None` where users have no folder for caches.
+fn tuning_file(device: &Device) -> Option<PathBuf> {
+    let adapter = device.info().name.to_lowercase();
+    let adapter = adapter.replace(|c: char| !c.is_ascii_alphanumeric(), "-");
+    let folder = dirs::cache_dir()?.join("whereabot");
+    Some(folder.join(format!("tuning-{adapter}.json")))
+}
+
+/// What to compute in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(super) enum PrecisionName {
+    F32,
+    F16,
+}
+
+impl From<PrecisionName> for Precision {
+    fn from(name: PrecisionName) -> Self {
+        match name {
+            PrecisionName::F32 => Self::F32,
+            PrecisionName::F16 => Self::F16,
+        }
+    }
+}

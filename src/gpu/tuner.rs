@@ -1,0 +1,273 @@
+use std::collections::BTreeMap;
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use serde::{Deserialize, Serialize};
+
+use super::choice::{Conv2dKernel, by};
+use super::conv2d::Conv2d;
+use super::step::Step;
+use super::{Device, GpuError, Layout};
+
+/// Times the kernels that serve a layer on the adapter, and remembers the fastest. A kernel that fails, or
+/// does not answer as `conv2d_buffer` does, is never chosen.
+#[derive(Debug, Default)]
+pub(super) struct Tuner {
+    state: Mutex<State>,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    left: Duration,
+    winners: BTreeMap<String, String>,
+    changed: bool,
+}
+
+/// What is remembered from one process to the next.
+#[derive(Serialize, Deserialize)]
+struct Memory {
+    /// The adapter, its driver and the kernels that were compared.
+    of: String,
+    /// By layer.
+    winners: BTreeMap<String, String>,
+}
+
+impl Tuner {
+    /// With `limit` to spend. `memory` is what [`Tuner::memory`] gave; another adapter's, another
+    /// version's or no such thing at all is passed over.
+    pub fn new(limit: Duration, info: &wgpu::AdapterInfo, memory: &[u8]) -> Self {
+        let memory = serde_json::from_slice::<Memory>(memory).ok();
+        let ours = memory.filter(|memory| memory.of == identity(info));
+        let state = State {
+            left: limit,
+            winners: ours.map(|memory| memory.winners).unwrap_or_default(),
+            changed: false,
+        };
+        Self {
+            state: Mutex::new(state),
+        }
+    }
+
+    /// What to remember, if there is anything new.
+    pub fn memory(&self, info: &wgpu::AdapterInfo) -> Option<Vec<u8>> {
+        let mut state = self.state();
+        if !std::mem::take(&mut state.changed) {
+            return None;
+        }
+        let memory = Memory {
+            of: identity(info),
+            winners: state.winners.clone(),
+        };
+        serde_json::to_vec_pretty(&memory).ok()
+    }
+
+    /// The fastest of `candidates`; `None` where there is no choice, or no time left to find out.
+    /// Overwrites what the layer reads and makes.
+    pub fn choose(
+        &self,
+        device: &Device,
+        conv: &Conv2d<'_>,
+        candidates: &[Conv2dKernel],
+    ) -> Result<Option<Conv2dKernel>, GpuError> {
+        // Between textures the order is known, and compiling each candidate would take a second.
+        if candidates.len() < 2 || conv.input.layout() == Layout::Texture {
+            return Ok(None);
+        }
+        let layer = describe(conv);
+        let mut state = self.state();
+        let known = state.winners.get(&layer);
+        let known = known.and_then(|name| candidates.iter().find(|k| k.to_string() == *name));
+        if let Some(known) = known {
+            return Ok(Some(*known));
+        }
+        if state.left.is_zero() {
+            return Ok(None);
+        }
+        let start = Instant::now();
+        let fastest = fastest(device, conv, candidates, start + state.left)?;
+        state.left = state.left.saturating_sub(start.elapsed());
+        if let Some(fastest) = fastest {
+            state.winners.insert(layer, fastest.to_string());
+            state.changed = true;
+        }
+        Ok(fastest)
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Of an adapter, its driver, and the kernels.
+fn identity(info: &wgpu::AdapterInfo) -> String {
+    let mut kernels = DefaultHasher::new();
+    [
+        include_str!("../../shaders/conv2d_buffer.wgsl"),
+        include_str!("../../shaders/conv2d_tiled.wgsl"),
+        include_str!("../../shaders/conv2d_matrix.wgsl"),
+        include_str!("../../shaders/conv2d_cooperative.wgsl"),
+        include_str!("../../shaders/layout/buffer.wgsl"),
+        include_str!("../../shaders/layout/half_buffer.wgsl"),
+    ]
+    .hash(&mut kernels);
+    format!(
+        "{} ({:04x}:{:04x}, {}), {} {}, kernels {:016x}",
+        info.name,
+        info.vendor,
+        info.device,
+        info.backend,
+        info.driver,
+        info.driver_info,
+        kernels.finish()
+    )
+}
+
+/// What a layer's time depends on.
+fn describe(conv: &Conv2d<'_>) -> String {
+    let (input, output) = (conv.input.shape, conv.output.shape);
+    format!(
+        "{input} to {} channels, kernel {}, dilation {}, batch {}, {:?}",
+        output.channels,
+        conv.kernel,
+        conv.dilation,
+        conv.output.batch,
+        conv.input.layout()
+    )
+}
+
+/// `None` where `deadline` came before all were timed.
+fn fastest(
+    device: &Device,
+    conv: &Conv2d<'_>,
+    candidates: &[Conv2dKernel],
+    deadline: Instant,
+) -> Result<Option<Conv2dKernel>, GpuError> {
+    conv.input.fill(device);
+    let plan = |kernel| device.scoped(|| by(kernel, device, conv));
+    let expected = {
+        let step = plan(Conv2dKernel::Buffer)?;
+        run(device, &step, 1)?;
+        conv.output.sample(device)?
+    };
+    let greatest = expected.iter().fold(0.0_f32, |most, v| most.max(v.abs()));
+    let mut best = None;
+    for &kernel in candidates {
+        let step = match plan(kernel) {
+            Ok(step) => step,
+            Err(error) => {
+                device.check()?;
+                log::warn!("{}: `{kernel}` is not used: {error}", conv.label);
+                continue;
+            }
+        };
+        let once = run(device, &step, 1)?;
+        let found = conv.output.sample(device)?;
+        // Products of halves are off by a thousandth; what is put together wrongly, by far more.
+        let right = |(found, expected): (&f32, &f32)| (found - expected).abs() <= 0.02 * greatest;
+        if !found.iter().zip(&expected).all(right) {
+            log::warn!(
+                "{}: `{kernel}` is not used: its answer is wrong here",
+                conv.label
+            );
+            continue;
+        }
+        // The first run may have compiled: the second says how many fill some milliseconds.
+        let once = run(device, &step, 1)?
+            .min(once)
+            .max(Duration::from_micros(20));
+        let repeats = (3000 / once.as_micros()).clamp(1, 50) as u32;
+        let mut time = Duration::MAX;
+        for _ in 0..3 {
+            time = time.min(run(device, &step, repeats)? / repeats);
+        }
+        if Instant::now() > deadline {
+            return Ok(None);
+        }
+        if best.is_none_or(|(least, _)| time < least) {
+            best = Some((time, kernel));
+        }
+    }
+    Ok(best.map(|(_, kernel)| kernel))
+}
+
+/// How long so many runs take, submission included.
+fn run(device: &Device, step: &Step, repeats: u32) -> Result<Duration, GpuError> {
+    let mut encoder = device.wgpu().create_command_encoder(&Default::default());
+    let mut pass = encoder.begin_compute_pass(&Default::default());
+    for _ in 0..repeats {
+        step.encode(&mut pass);
+    }
+    drop(pass);
+    let start = Instant::now();
+    device.queue().submit([encoder.finish()]);
+    device.wait()?;
+    Ok(start.elapsed())
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use crate::gpu::{AdapterRequest, Tensor};
+    use crate::network::{Activation, Parameters, Shape};
+
+    /// What a tuner chooses among `candidates` for a small layer between buffers.
+    fn choose(device: &Device, tuner: &Tuner, candidates: &[Conv2dKernel]) -> Option<Conv2dKernel> {
+        let shape = Shape::new(8, 5, 6);
+        let tensor = |what| Tensor::in_layout(device, Layout::Buffer, what, shape, 1, 0).unwrap();
+        let parameters = Parameters {
+            weight: (0..64).map(|i| (i as f32).sin()).collect(),
+            bias: vec![0.5; 8],
+        };
+        let conv = Conv2d {
+            label: "layer",
+            input: &tensor("input"),
+            output: &tensor("output"),
+            parameters: &parameters,
+            kernel: 1,
+            dilation: 1,
+            activation: Activation::None,
+        };
+        tuner.choose(device, &conv, candidates).unwrap()
+    }
+
+    #[test]
+    fn the_winner_is_remembered_and_what_is_foreign_is_not() {
+        use Conv2dKernel::{Buffer, Tiled};
+        let device = Device::open(&AdapterRequest::new(None, None)).unwrap();
+        let info = device.info();
+        let both = [Tiled(2), Buffer];
+        let tuner = Tuner::new(Duration::from_secs(60), info, b"not JSON");
+        let winner = choose(&device, &tuner, &both).unwrap();
+        let memory = tuner.memory(info).unwrap();
+        assert!(tuner.memory(info).is_none(), "nothing new");
+
+        // Without any time, only what is remembered can be known.
+        let no_time = |memory: &[u8]| {
+            let tuner = Tuner::new(Duration::ZERO, info, memory);
+            let chosen = choose(&device, &tuner, &both);
+            assert!(tuner.memory(info).is_none());
+            chosen
+        };
+        assert_eq!(no_time(&memory), Some(winner));
+        let text = String::from_utf8(memory).unwrap();
+        let other = if winner == Buffer { Tiled(2) } else { Buffer };
+        let swapped = text.replace(&winner.to_string(), &other.to_string());
+        assert_eq!(no_time(swapped.as_bytes()), Some(other));
+        let nobody = text.replace(&winner.to_string(), "conv2d_quantum");
+        assert_eq!(no_time(nobody.as_bytes()), None);
+        let foreign = text.replace("kernels", "kernels of a friend,");
+        assert_eq!(no_time(foreign.as_bytes()), None);
+        assert_eq!(no_time(b""), None);
+    }
+
+    #[test]
+    fn a_kernel_that_cannot_run_here_is_passed_over() {
+        use Conv2dKernel::{Buffer, Subgroup};
+        let device = Device::open(&AdapterRequest::new(None, None)).unwrap();
+        let tuner = Tuner::new(Duration::from_secs(60), device.info(), b"");
+        // It binds textures, and gets buffers.
+        assert_eq!(choose(&device, &tuner, &[Subgroup, Buffer]), Some(Buffer));
+    }
+}
