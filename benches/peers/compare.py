@@ -35,12 +35,12 @@ OURS, REFERENCE, TRUTH = "whereabot", "whereabot --adapter cpu", "onnxruntime"
 LINES = {
     OURS: "whereabot", REFERENCE: "whereabot, plain Rust", TRUTH: "ONNX Runtime CPU", "openvino": "OpenVINO CPU",
     "openvino-bf16": "OpenVINO CPU, bf16", "ncnn": "ncnn CPU", "ncnn-vulkan": "ncnn Vulkan", "tract": "tract CPU",
-    "torch": "PyTorch CPU", "torch-cuda": "PyTorch CUDA", "torch-cuda-f16": "PyTorch CUDA, f16",
+    "burn": "burn wgpu", "torch": "PyTorch CPU", "torch-cuda": "PyTorch CUDA", "torch-cuda-f16": "PyTorch CUDA, f16",
     "torch-cuda-compile": "PyTorch CUDA, f16, compiled", "torch-cuda-graph": "PyTorch CUDA, f16, graph",
 }
 TORCH = [name for name in LINES if name.startswith("torch")]
 HALF = {"openvino-bf16", *TORCH[2:]}
-PROGRAMS = {"tract": "whereabot-peer-tract"}
+PROGRAMS = {"tract": "whereabot-peer-tract", "burn": "whereabot-peer-burn"}
 
 # How far answers may be from ONNX Runtime's: of a mask's probabilities the largest difference, of thresholded masks the
 # smallest IoU, of joints the largest distance.
@@ -245,7 +245,8 @@ def start(name, case, args):
     environment = {"OMP_NUM_THREADS": str(args.threads)}
     if name in PROGRAMS:
         cargo(HERE / name)
-        return Worker([TARGET / "release" / PROGRAMS[name], *shape, case.onnx], case, name, environment)
+        model = case.weights if name == "burn" else case.onnx
+        return Worker([TARGET / "release" / PROGRAMS[name], *shape, model], case, name, environment)
     python, model = sys.executable, case.onnx
     if name in TORCH:
         python, model = args.torch, case.weights
@@ -258,8 +259,9 @@ def version(name, args):
     if name in (OURS, REFERENCE):
         return subprocess.run([args.whereabot, "--version"], capture_output=True, text=True, check=True).stdout.split()[-1]
     if name in PROGRAMS:
+        crate = {"tract": "tract-onnx"}.get(name, name)
         packages = tomllib.loads((HERE / name / "Cargo.lock").read_text())["package"]
-        return next(package["version"] for package in packages if package["name"] == f"{name}-onnx")
+        return next(package["version"] for package in packages if package["name"] == crate)
     if name in TORCH:
         return subprocess.run([args.torch, "-c", "import torch; print(torch.__version__)"], capture_output=True,
                               text=True, check=True).stdout.strip()
