@@ -1,37 +1,14 @@
-// Convolution with stride 1, dilation and zero padding 'same', from buffer to buffer; bias and
-// activation fused: on every adapter.
-//
-// An invocation makes COLUMNS pixels of one row, TILES apart so that neighbouring invocations read
-// neighbouring texels, in eight output channels: two blocks of four.
-
-override KERNEL: u32;
-override DILATION: u32;
-// 0 none, 1 ReLU, 2 sigmoid
-override ACTIVATION: u32;
+// A convolution between buffers on every adapter, behind `conv2d_planes`. An invocation makes COLUMNS
+// pixels of one row, TILES apart so that neighbouring invocations read neighbouring texels, in eight
+// output channels: two blocks of four.
 
 const COLUMNS = 4u;
-override IN_BLOCKS: u32 = INPUT_PLANES / BATCH;
-override OUT_BLOCKS: u32 = OUTPUT_PLANES / BATCH;
-override HEIGHT: u32 = OUTPUT_HEIGHT;
-override WIDTH: u32 = OUTPUT_WIDTH;
 override TILES: u32 = (WIDTH + COLUMNS - 1u) / COLUMNS;
 override OUT_PAIRS: u32 = (OUT_BLOCKS + 1u) / 2u;
 override INVOCATIONS: u32 = BATCH * OUT_PAIRS * HEIGHT * TILES;
 
 // [out block][kernel row][kernel column][in block], a column of the matrix for each input channel
 @group(0) @binding(3) var<storage, read> weights: array<mat4x4<f32>>;
-// [out block]
-@group(0) @binding(4) var<storage, read> bias: array<vec4<f32>>;
-
-fn activate(x: vec4<f32>) -> vec4<f32> {
-    if ACTIVATION == 1u {
-        return max(x, vec4(0.0));
-    }
-    if ACTIVATION == 2u {
-        return 1.0 / (1.0 + exp(-x));
-    }
-    return x;
-}
 
 @compute @workgroup_size(64)
 fn main(

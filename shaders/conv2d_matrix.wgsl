@@ -1,15 +1,9 @@
-// Convolution with stride 1, dilation and zero padding 'same', bias and activation fused: a product of
-// matrices in tiles of 16 x 16, which subgroups of 32 multiply by what stands in front of this. Factors
-// are halves, sums f32.
+// A convolution between buffers as a product of matrices in tiles of 16 x 16, behind `conv2d_planes` and
+// what multiplies tiles, in subgroups of 32. Factors are halves, sums f32.
 //
 // A workgroup of four subgroups makes TILE pixels of an image, as they come row after row, in 32 output
 // channels; a subgroup makes 32 of the pixels. Of each tap it brings STEP blocks of input channels and
 // their weights to workgroup memory.
-
-override KERNEL: u32;
-override DILATION: u32;
-// 0 none, 1 ReLU, 2 sigmoid
-override ACTIVATION: u32;
 
 const TILE = 128u;
 // Output blocks of a workgroup.
@@ -21,10 +15,6 @@ const SUMS_STRIDE = 4u * BLOCKS + 4u;
 // Not written out, as loops to a size are.
 const DEPTH = STEP / 4u;
 
-override IN_BLOCKS: u32 = INPUT_PLANES / BATCH;
-override OUT_BLOCKS: u32 = OUTPUT_PLANES / BATCH;
-override HEIGHT: u32 = OUTPUT_HEIGHT;
-override WIDTH: u32 = OUTPUT_WIDTH;
 override STEPS: u32 = (IN_BLOCKS + STEP - 1u) / STEP;
 override TILES: u32 = (HEIGHT * WIDTH + TILE - 1u) / TILE;
 override BLOCK_GROUPS: u32 = (OUT_BLOCKS + BLOCKS - 1u) / BLOCKS;
@@ -32,8 +22,6 @@ override BLOCK_GROUPS: u32 = (OUT_BLOCKS + BLOCKS - 1u) / BLOCKS;
 // [kernel row][kernel column][in block, to full steps][out block, to full groups][in channel] of four
 // outputs
 @group(0) @binding(3) var<storage, read> weights: array<vec4<f32>>;
-// [out block, to full groups]
-@group(0) @binding(4) var<storage, read> bias: array<vec4<f32>>;
 
 // [pixel][in channel]
 var<workgroup> values: array<Half, TILE * VALUES_STRIDE>;
@@ -46,20 +34,10 @@ var<workgroup> sums: array<f32, TILE * SUMS_STRIDE>;
 var<private> local: u32;
 var<private> pixel: u32;
 
-fn activate(x: vec4<f32>) -> vec4<f32> {
-    if ACTIVATION == 1u {
-        return max(x, vec4(0.0));
-    }
-    if ACTIVATION == 2u {
-        return 1.0 / (1.0 + exp(-x));
-    }
-    return x;
-}
-
-// What a tap, as many rows and columns away as `offset` says, sees of blocks from `first` on.
-fn bring_values(image: u32, first: u32, offset: vec2<i32>) {
-    let at = vec2(i32(pixel % WIDTH), i32(pixel / WIDTH)) + offset;
-    let inside = all(at >= vec2(0)) && all(at < vec2(i32(WIDTH), i32(HEIGHT)));
+// What a tap sees of STEP blocks of channels from `first` on.
+fn bring_values(image: u32, first: u32, tap: u32) {
+    let at = seen_from(pixel, tap);
+    let inside = is_inside(at);
     for (var n = 0u; n < STEP; n++) {
         var value = vec4(0.0);
         if inside && first + n < IN_BLOCKS {
@@ -117,11 +95,9 @@ fn main(
     var lower_right = sums_at(lower * SUMS_STRIDE + 16u);
 
     for (var tap = 0u; tap < KERNEL * KERNEL; tap++) {
-        let place = vec2(tap % KERNEL, tap / KERNEL);
-        let offset = (vec2<i32>(place) - i32(KERNEL / 2u)) * i32(DILATION);
         for (var step = 0u; step < STEPS; step++) {
             workgroupBarrier();
-            bring_values(image, step * STEP, offset);
+            bring_values(image, step * STEP, tap);
             bring_taps((tap * STEPS + step) * STEP * BLOCK_GROUPS * BLOCKS + first_block);
             workgroupBarrier();
             for (var k = 0u; k < DEPTH; k++) {

@@ -1,15 +1,10 @@
-// Convolution with stride 1, dilation and zero padding 'same', bias and activation fused: a product of
-// matrices, through workgroup memory. For GPUs.
+// A convolution between buffers as a product of matrices, through workgroup memory, behind
+// `conv2d_planes`: for GPUs.
 //
 // A workgroup makes TILE pixels of an image, as they come row after row, in BLOCKS blocks of four output
 // channels. Of each tap it brings STEP blocks of input channels and their weights to workgroup memory,
 // where its invocations share them: each makes PIXELS pixels, LANES apart, in a pair of blocks, and
 // reads from there two texels for sixteen multiply-adds each.
-
-override KERNEL: u32;
-override DILATION: u32;
-// 0 none, 1 ReLU, 2 sigmoid
-override ACTIVATION: u32;
 
 const GROUP = 64u;
 const LANES = GROUP / PAIRS;
@@ -18,10 +13,6 @@ const BLOCKS = 2u * PAIRS;
 // Not written out, as loops to a size are: long enough as it is.
 const DEPTH = STEP;
 
-override IN_BLOCKS: u32 = INPUT_PLANES / BATCH;
-override OUT_BLOCKS: u32 = OUTPUT_PLANES / BATCH;
-override HEIGHT: u32 = OUTPUT_HEIGHT;
-override WIDTH: u32 = OUTPUT_WIDTH;
 override STEPS: u32 = (IN_BLOCKS + STEP - 1u) / STEP;
 override TILES: u32 = (HEIGHT * WIDTH + TILE - 1u) / TILE;
 override BLOCK_GROUPS: u32 = (OUT_BLOCKS + BLOCKS - 1u) / BLOCKS;
@@ -29,28 +20,16 @@ override BLOCK_GROUPS: u32 = (OUT_BLOCKS + BLOCKS - 1u) / BLOCKS;
 // [kernel row][kernel column][in block, to full steps][out block, to full groups][in channel] of four
 // outputs
 @group(0) @binding(3) var<storage, read> weights: array<vec4<f32>>;
-// [out block, to full groups]
-@group(0) @binding(4) var<storage, read> bias: array<vec4<f32>>;
 
 // [in block][pixel]
 var<workgroup> values: array<vec4<f32>, STEP * TILE>;
 // [in block][out block][in channel] of four outputs
 var<workgroup> taps: array<vec4<f32>, STEP * BLOCKS * 4u>;
 
-fn activate(x: vec4<f32>) -> vec4<f32> {
-    if ACTIVATION == 1u {
-        return max(x, vec4(0.0));
-    }
-    if ACTIVATION == 2u {
-        return 1.0 / (1.0 + exp(-x));
-    }
-    return x;
-}
-
-// What a tap sees of a block of channels at `pixel`, as many rows and columns away as `offset` says.
-fn seen(image: u32, block: u32, pixel: u32, offset: vec2<i32>) -> vec4<f32> {
-    let at = vec2(i32(pixel % WIDTH), i32(pixel / WIDTH)) + offset;
-    if block < IN_BLOCKS && all(at >= vec2(0)) && all(at < vec2(i32(WIDTH), i32(HEIGHT))) {
+// What a tap sees of a block of channels from `pixel`.
+fn seen(image: u32, block: u32, pixel: u32, tap: u32) -> vec4<f32> {
+    let at = seen_from(pixel, tap);
+    if block < IN_BLOCKS && is_inside(at) {
         return input_at(block * BATCH + image, u32(at.y), u32(at.x));
     }
     return vec4(0.0);
@@ -83,15 +62,13 @@ fn main(
     }
 
     for (var tap = 0u; tap < KERNEL * KERNEL; tap++) {
-        let place = vec2(tap % KERNEL, tap / KERNEL);
-        let offset = (vec2<i32>(place) - i32(KERNEL / 2u)) * i32(DILATION);
         for (var step = 0u; step < STEPS; step++) {
             workgroupBarrier();
             for (var n = 0u; n < STAGED; n++) {
                 let i = n * GROUP + local;
                 if i < STEP * TILE {
                     let block = step * STEP + i / TILE;
-                    values[i] = seen(image, block, first_pixel + i % TILE, offset);
+                    values[i] = seen(image, block, first_pixel + i % TILE, tap);
                 }
             }
             let first = (tap * STEPS + step) * STEP;

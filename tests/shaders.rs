@@ -19,9 +19,13 @@ use Layout::{Buffer, HalfBuffer};
 const KERNELS: [Kernel; 19] = [
     (&["back_project"], &Layout::ALL, &[]),
     (&["concat"], &Layout::ALL, &[]),
-    (&["conv2d_buffer"], &[Buffer, HalfBuffer], &[]),
     (
-        &["conv2d_cooperative", "conv2d_matrix"],
+        &["conv2d_planes", "conv2d_buffer"],
+        &[Buffer, HalfBuffer],
+        &[],
+    ),
+    (
+        &["conv2d_cooperative", "conv2d_planes", "conv2d_matrix"],
         &[HalfBuffer],
         &[("STEP", 4)],
     ),
@@ -41,7 +45,7 @@ const KERNELS: [Kernel; 19] = [
         &[("ROWS", 3), ("KERNEL", 3)],
     ),
     (
-        &["conv2d_tiled"],
+        &["conv2d_planes", "conv2d_tiled"],
         &[Buffer, HalfBuffer],
         &[("PIXELS", 4), ("PAIRS", 2), ("STEP", 2), ("STAGED", 4)],
     ),
@@ -212,7 +216,11 @@ fn every_kernel_computes() {
 
 #[test]
 fn a_wrong_kernel_is_noticed() {
-    let right = kernel_text(Some(Buffer), &[], &source("conv2d_buffer"));
+    let right = kernel_text(
+        Some(Buffer),
+        &[],
+        &(source("conv2d_planes") + &source("conv2d_buffer")),
+    );
     resolved(&right).unwrap();
     assert!(resolved(&right.replace("vec4(0.0)", "vec3(0.0)")).is_err());
 }

@@ -103,6 +103,7 @@ impl Tuner {
 fn identity(info: &wgpu::AdapterInfo) -> String {
     let mut kernels = DefaultHasher::new();
     [
+        include_str!("../../shaders/conv2d_planes.wgsl"),
         include_str!("../../shaders/conv2d_buffer.wgsl"),
         include_str!("../../shaders/conv2d_tiled.wgsl"),
         include_str!("../../shaders/conv2d_matrix.wgsl"),

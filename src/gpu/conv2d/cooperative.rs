@@ -1,6 +1,6 @@
-use super::Conv2d;
-use crate::gpu::step::{Step, StepDescriptor, Tensors, activation_number};
-use crate::gpu::tensor::{blocks, constant_buffer};
+use super::{Conv2d, planes};
+use crate::gpu::step::Step;
+use crate::gpu::tensor::blocks;
 use crate::gpu::{Device, GpuError};
 
 /// Pixels that a workgroup makes, and blocks of output channels, as in the kernel.
@@ -19,40 +19,23 @@ pub fn cooperative(device: &Device, conv: &Conv2d<'_>) -> Result<Step, GpuError>
 
 /// A step of `shaders/conv2d_matrix.wgsl` with `units` in front, which multiply its tiles.
 fn matrix(device: &Device, conv: &Conv2d<'_>, units: &str) -> Result<Step, GpuError> {
-    let Conv2d { label, output, .. } = *conv;
+    let output = conv.output;
     let step = if conv.input.shape.channels > 16 { 8 } else { 4 };
     let padded_in = blocks(conv.input.shape.channels).next_multiple_of(step);
     let padded_out = blocks(output.shape.channels).next_multiple_of(BLOCKS);
-    let weights = conv.packed_matrices(padded_in, padded_out);
-    let weights = constant_buffer(device, &format!("{label}: weight"), &weights)?;
-    let bias = constant_buffer(
-        device,
-        &format!("{label}: bias"),
-        &conv.padded_bias(padded_out),
-    )?;
     let tiles = (output.shape.height * output.shape.width).div_ceil(TILE);
-    let source = include_str!("../../../shaders/conv2d_matrix.wgsl");
-    Step::new(
+    let shared = concat!(
+        include_str!("../../../shaders/conv2d_planes.wgsl"),
+        include_str!("../../../shaders/conv2d_matrix.wgsl")
+    );
+    planes(
         device,
-        &StepDescriptor {
-            label,
-            kernel: "conv2d_cooperative",
-            source: &format!("{units}{source}"),
-            entry_point: "main",
-            tensors: Tensors::from_to(conv.input, output),
-            constants: &[
-                ("KERNEL", conv.kernel as f64),
-                ("DILATION", conv.dilation as f64),
-                ("ACTIVATION", activation_number(conv.activation).into()),
-            ],
-            sizes: &[("STEP", step)],
-            bindings: &[
-                (3, weights.as_entire_binding()),
-                (4, bias.as_entire_binding()),
-            ],
-            workgroups: output.batch * tiles * (padded_out / BLOCKS),
-            work: conv.work(),
-        },
+        conv,
+        ("conv2d_cooperative", &format!("{units}{shared}")),
+        &[("STEP", step)],
+        &conv.packed_matrices(padded_in, padded_out),
+        padded_out,
+        output.batch * tiles * (padded_out / BLOCKS),
     )
 }
 

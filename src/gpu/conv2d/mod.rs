@@ -81,6 +81,45 @@ impl Conv2d<'_> {
     }
 }
 
+/// A step of a `kernel` between buffers, `source` with `shaders/conv2d_planes.wgsl` in front, which makes
+/// `out_blocks` blocks of output channels, those beyond the last of zeros.
+fn planes(
+    device: &Device,
+    conv: &Conv2d<'_>,
+    (kernel, source): (&'static str, &str),
+    sizes: &[(&str, usize)],
+    weights: &[f32],
+    out_blocks: usize,
+    workgroups: usize,
+) -> Result<Step, GpuError> {
+    let label = conv.label;
+    let weights = constant_buffer(device, &format!("{label}: weight"), weights)?;
+    let bias = conv.padded_bias(out_blocks);
+    let bias = constant_buffer(device, &format!("{label}: bias"), &bias)?;
+    Step::new(
+        device,
+        &StepDescriptor {
+            label,
+            kernel,
+            source,
+            entry_point: "main",
+            tensors: Tensors::from_to(conv.input, conv.output),
+            constants: &[
+                ("KERNEL", conv.kernel as f64),
+                ("DILATION", conv.dilation as f64),
+                ("ACTIVATION", activation_number(conv.activation).into()),
+            ],
+            sizes,
+            bindings: &[
+                (3, weights.as_entire_binding()),
+                (4, bias.as_entire_binding()),
+            ],
+            workgroups,
+            work: conv.work(),
+        },
+    )
+}
+
 /// The margin that a convolution's input wants in textures. Taps farther away than the image is long
 /// find zeros wherever they look: the margin need not go on to them.
 pub(super) fn margin(input: Shape, kernel: usize, dilation: usize) -> usize {

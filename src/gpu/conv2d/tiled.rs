@@ -1,6 +1,6 @@
-use super::Conv2d;
-use crate::gpu::step::{Step, StepDescriptor, Tensors, activation_number};
-use crate::gpu::tensor::{blocks, constant_buffer};
+use super::{Conv2d, planes};
+use crate::gpu::step::Step;
+use crate::gpu::tensor::blocks;
 use crate::gpu::{Device, GpuError};
 
 /// Invocations of a workgroup, as in the kernel.
@@ -49,37 +49,23 @@ impl Tiling {
 /// `shaders/conv2d_tiled.wgsl`: every convolution between buffers, with `pixels` pixels an invocation. Many
 /// need few reads, few make more workgroups.
 pub fn tiled(device: &Device, conv: &Conv2d<'_>, pixels: usize) -> Result<Step, GpuError> {
-    let Conv2d { label, output, .. } = *conv;
     let tiling = Tiling::new(conv, pixels);
-    let weights = conv.packed_matrices(tiling.padded_in, tiling.padded_out);
-    let weights = constant_buffer(device, &format!("{label}: weight"), &weights)?;
-    let bias = conv.padded_bias(tiling.padded_out);
-    let bias = constant_buffer(device, &format!("{label}: bias"), &bias)?;
-    Step::new(
+    let source = concat!(
+        include_str!("../../../shaders/conv2d_planes.wgsl"),
+        include_str!("../../../shaders/conv2d_tiled.wgsl")
+    );
+    planes(
         device,
-        &StepDescriptor {
-            label,
-            kernel: "conv2d_tiled",
-            source: include_str!("../../../shaders/conv2d_tiled.wgsl"),
-            entry_point: "main",
-            tensors: Tensors::from_to(conv.input, output),
-            constants: &[
-                ("KERNEL", conv.kernel as f64),
-                ("DILATION", conv.dilation as f64),
-                ("ACTIVATION", activation_number(conv.activation).into()),
-            ],
-            sizes: &[
-                ("PIXELS", tiling.pixels),
-                ("PAIRS", tiling.pairs),
-                ("STEP", tiling.step),
-                ("STAGED", (tiling.step * tiling.tile).div_ceil(GROUP)),
-            ],
-            bindings: &[
-                (3, weights.as_entire_binding()),
-                (4, bias.as_entire_binding()),
-            ],
-            workgroups: tiling.workgroups(),
-            work: conv.work(),
-        },
+        conv,
+        ("conv2d_tiled", source),
+        &[
+            ("PIXELS", tiling.pixels),
+            ("PAIRS", tiling.pairs),
+            ("STEP", tiling.step),
+            ("STAGED", (tiling.step * tiling.tile).div_ceil(GROUP)),
+        ],
+        &conv.packed_matrices(tiling.padded_in, tiling.padded_out),
+        tiling.padded_out,
+        tiling.workgroups(),
     )
 }
