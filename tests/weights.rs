@@ -85,8 +85,8 @@ fn gpu_and_reference_agree_on_photos() {
 
 #[test]
 fn halves_say_the_same() {
-    // Where all pixels stay on their side of the overlay's threshold, joints stay within a tenth of a
-    // millimetre; each pixel that does not moves them by one or two, and the paper's by more.
+    // A pixel that crosses the overlay's threshold is in or out, and moves joints by up to three millimetres;
+    // where none does, they stay within a tenth of one.
     for (name, images) in ROBOTS {
         let model = model(name);
         let [mut full, mut half] = [Precision::F32, Precision::F16]
@@ -106,9 +106,12 @@ fn halves_say_the_same() {
             let overlap = iou(&full.1, &half.1);
             assert!(overlap >= 0.99, "{name}, {image}: IoU {overlap}");
             let metres = difference(&full.2, &half.2).unwrap();
-            println!("{name}, {image}: IoU {overlap:.4}, joints differ by {metres} m");
+            let crossed = full.1.iter().zip(&half.1).filter(|(a, b)| a != b).count();
+            println!(
+                "{name}, {image}: IoU {overlap:.4}, {crossed} pixels crossed, joints differ by {metres} m"
+            );
             assert!(
-                metres <= 3e-3,
+                metres <= 1e-4 + 3e-3 * crossed as f32,
                 "{name}, {image}: joints differ by {metres} m"
             );
             // Negative control: another picture's answer.
