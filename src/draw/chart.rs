@@ -49,7 +49,7 @@ pub struct BarGroup {
     pub bars: Vec<[f64; 2]>,
 }
 
-/// A bar a row, coloured by kind.
+/// A bar a row, coloured by kind: the kinds that make up most have colours of their own.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RowChart {
     /// What is shown, with its unit.
@@ -75,6 +75,7 @@ const PANEL: (u32, u32) = (560, 400);
 const FONT: &str = "sans-serif";
 const TEXT: f64 = 15.0;
 const INK: RGBColor = RGBColor(40, 40, 46);
+const GREY: RGBColor = RGBColor(150, 150, 156);
 const PALE: RGBColor = RGBColor(225, 225, 230);
 /// Told apart by those who see no red or green (Okabe and Ito).
 const COLOURS: [RGBColor; 6] = [
@@ -113,15 +114,23 @@ pub fn row_chart(chart: &RowChart) -> Result<RgbImage, ChartError> {
     const WIDTH: i32 = 900;
     const NAMES: i32 = 130;
     const NOTES: i32 = 260;
-    let mut kinds: Vec<&str> = Vec::new();
+    const OTHERS: &str = "others";
+    let mut totals: Vec<(&str, f64)> = Vec::new();
     for row in &chart.rows {
-        if !kinds.contains(&row.kind.as_str()) {
-            kinds.push(&row.kind);
+        match totals.iter_mut().find(|(kind, _)| *kind == row.kind) {
+            Some((_, total)) => *total += row.value,
+            None => totals.push((&row.kind, row.value)),
         }
     }
+    totals.sort_by(|(_, a), (_, b)| b.total_cmp(a));
+    let mut kinds: Vec<&str> = totals.iter().map(|(kind, _)| *kind).collect();
+    if kinds.len() > COLOURS.len() {
+        kinds.truncate(COLOURS.len());
+        kinds.push(OTHERS);
+    }
     let colour_of = |kind: &str| {
-        let place = kinds.iter().position(|k| *k == kind).unwrap_or(0);
-        COLOURS.iter().cycle().nth(place).copied().unwrap_or(INK)
+        let place = kinds.iter().position(|k| *k == kind);
+        place.and_then(|p| COLOURS.get(p)).copied().unwrap_or(GREY)
     };
     let top = chart.rows.iter().map(|row| row.value).fold(1e-9, f64::max);
     let lines = chart.rows.len() as i32 + kinds.len().div_ceil(3) as i32 + 3;
@@ -141,16 +150,16 @@ pub fn row_chart(chart: &RowChart) -> Result<RgbImage, ChartError> {
         let mut y = 2 * LINE - LINE / 2;
         for row in &chart.rows {
             let length = f64::from(WIDTH - NAMES - NOTES) * row.value / top;
-            text(&row.name, 12, y + 1, TEXT)?;
+            text(&row.name, 12, y + 5, TEXT)?;
             bar(&row.kind, NAMES, y, length as i32)?;
-            text(&row.note, NAMES + length as i32 + 8, y + 1, TEXT)?;
+            text(&row.note, NAMES + length as i32 + 8, y + 5, TEXT)?;
             y += LINE;
         }
         y += LINE / 2;
         for (number, kind) in (0..).zip(&kinds) {
             let (x, y) = (12 + number % 3 * 290, y + number / 3 * LINE);
             bar(kind, x, y, LINE - 6)?;
-            text(kind, x + LINE, y + 1, TEXT)?;
+            text(kind, x + LINE, y + 5, TEXT)?;
         }
         Ok(())
     })?;
