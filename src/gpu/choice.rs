@@ -64,13 +64,15 @@ impl Conv2dKernel {
         fits && self.layouts().contains(&conv.input.layout())
     }
 
-    /// Whether it is the better choice where nothing was measured: tiles should be full, and workgroups
-    /// enough for a large GPU.
-    fn suits(self, conv: &Conv2d<'_>) -> bool {
-        let (input, output) = (conv.input.shape, conv.output.shape);
+    /// Whether it is the better choice where nothing was measured. What was never run is not, and on CPU
+    /// rasterisers workgroup memory is slower than any other; for a large GPU there should be workgroups enough.
+    fn suits(self, device: &Device, conv: &Conv2d<'_>) -> bool {
         match self {
-            Self::Cooperative => input.channels.min(output.channels) >= 16,
-            Self::Tiled(pixels) => pixels == 2 || Tiling::new(conv, pixels).workgroups() >= 256,
+            Self::Cooperative => false,
+            Self::Tiled(pixels) => {
+                let enough = pixels == 2 || Tiling::new(conv, pixels).workgroups() >= 256;
+                enough && device.info().device_type != wgpu::DeviceType::Cpu
+            }
             _ => true,
         }
     }
@@ -102,7 +104,9 @@ pub(super) fn conv2d(
         Some(only) => candidates.contains(&only).then_some(only),
         None => match device.tuner().choose(device, conv, &candidates)? {
             Some(fastest) => Some(fastest),
-            None => candidates.into_iter().find(|kernel| kernel.suits(conv)),
+            None => candidates
+                .into_iter()
+                .find(|kernel| kernel.suits(device, conv)),
         },
     };
     match chosen {
