@@ -493,8 +493,12 @@ fn storage_texture(
     let side = limits.max_texture_dimension_2d;
     // Mesa compiles a kernel again for textures of one layer, and for sides that are powers of two:
     // that takes a second in all, and a texel or a layer too much takes nothing.
-    let [width, height] = [width, height].map(|side| side + usize::from(side.is_power_of_two()));
-    let layers = layers.max(2);
+    let uneven = |side: usize| side + usize::from(side.is_power_of_two());
+    let (mut width, height, layers) = (uneven(width), uneven(height), layers.max(2));
+    if width == height && layers.is_multiple_of(6) {
+        // wgpu's GL backend takes it for a cube.
+        width = uneven(width + 1);
+    }
     let require = |quantity: &str, needed: usize, allowed: u32| {
         device.require(
             &format!("{what}: {quantity}"),
@@ -583,5 +587,19 @@ mod tests {
         assert_eq!(unpack(&packed, shape, 2), values);
         // Negative control: the two layouts differ.
         assert_ne!(packed.get(..60), Some(values.as_slice()));
+    }
+
+    #[test]
+    #[allow(clippy::unwrap_used)]
+    fn no_texture_looks_like_a_cube() {
+        let device = Device::open(&crate::gpu::AdapterRequest::new(None, None)).unwrap();
+        for side in 1..20 {
+            let texture = storage_texture(&device, "test", [side, side, 6]).unwrap();
+            assert_ne!(texture.width(), texture.height());
+            assert!(!texture.width().is_power_of_two());
+        }
+        // Negative control: other textures may be square.
+        let texture = storage_texture(&device, "test", [7, 7, 5]).unwrap();
+        assert_eq!(texture.width(), texture.height());
     }
 }
