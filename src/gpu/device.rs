@@ -159,8 +159,8 @@ impl Device {
         &self.choice
     }
 
-    /// Lets plans find the fastest kernels for their layers by timing them, which takes `limit` at most,
-    /// all plans together. `memory` is what [`Device::tuning`] gave in an earlier process; what is of
+    /// Lets plans find the fastest kernels for their layers by timing them, which takes `limit`, all plans
+    /// together, and at most one kernel's compilation and timing more. `memory` is what [`Device::tuning`] gave in an earlier process; what is of
     /// another adapter, driver or version of this library, or no such thing at all, is passed over.
     #[must_use]
     pub fn tuned(mut self, limit: Duration, memory: &[u8]) -> Self {

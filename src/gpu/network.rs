@@ -39,7 +39,8 @@ impl NetworkPlan {
 
     /// Plans `network` to read `input`, whose shape must be the network's, and whose margin must be
     /// that of [`NetworkPlan::input`] or wider. All tensors get the layout of `input`. `name` goes
-    /// before the layers' names in errors and labels.
+    /// before the layers' names in errors and labels. On a [tuned](Device::tuned) device, what `input`
+    /// held before is lost.
     ///
     /// # Errors
     /// A layer that exceeds the adapter's limits, or a driver's refusal.
