@@ -45,10 +45,21 @@ impl Conv2dKernel {
 
     /// Whether `device` can run it, on the layers that it serves.
     pub fn runs_on(self, device: &Device) -> bool {
+        self.lacks(device).is_none()
+    }
+
+    /// What `device` lacks to run it; `None` where it can.
+    pub fn lacks(self, device: &Device) -> Option<String> {
         match self {
-            Self::SubgroupOne | Self::Subgroup => device.subgroup_size().is_some_and(|n| n >= 8),
-            Self::Cooperative => device.tier() == Tier::CooperativeMatrix,
-            Self::Texture | Self::Tiled(_) | Self::Buffer => true,
+            Self::SubgroupOne | Self::Subgroup => match device.subgroup_size() {
+                Some(8..) => None,
+                Some(size) => Some(format!("subgroups of 8 needed, {size} found")),
+                None => Some("subgroups of 8 needed, none found".into()),
+            },
+            Self::Cooperative if device.tier() < Tier::CooperativeMatrix => {
+                Some("matrix units needed, 16 x 16 halves summed in f32".into())
+            }
+            Self::Cooperative | Self::Texture | Self::Tiled(_) | Self::Buffer => None,
         }
     }
 
