@@ -9,6 +9,7 @@ mod known;
 use std::path::Path;
 
 use common::{description, model_file};
+use image::RgbaImage;
 use known::{XYZ, command, model};
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -299,7 +300,16 @@ fn without_timestamps_the_wall_clock_is_used_and_named() {
 #[test]
 fn a_plan_hands_out_its_steps_in_order_with_all_their_work() {
     let model = Model::from_bytes(&model_file(&description(32, 24, 4), 1), "random").unwrap();
-    let plan = Plan::new(&common::device(), &model, 3, Precision::F32).unwrap();
+    let device = common::device();
+    let mut plan = Plan::new(&device, &model, 3, Precision::F32).unwrap();
+    // What rectifies is made for the kind of source.
+    assert_eq!(plan.steps(true).next().unwrap().label(), "mask.conv1");
+    let camera = Camera::from_hfov(40, 30, 1.0);
+    let params = Rectification::new(&camera, &model.description.camera, 32, 24);
+    for index in 0..3 {
+        let image = RgbaImage::new(40, 30);
+        plan.write(&device, index, &image, &params).unwrap();
+    }
     let macs = |joints| {
         let joint = if joints {
             model.joint_network.macs()
