@@ -44,9 +44,11 @@ fn kernels() -> BTreeSet<String> {
         "conv2d_matrix",
         "conv2d_planes",
         "conv2d_rows",
+        "estimate_layout",
         "layout",
         "probe_arithmetic",
         "probe_copy",
+        "rectify",
         "render",
     ];
     std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("shaders"))

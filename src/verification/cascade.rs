@@ -1,7 +1,7 @@
 use image::{Rgba, RgbaImage, imageops};
 
 use super::comparison::Comparison;
-use super::kernel::numbers;
+use super::stages::numbers;
 use crate::camera::{Camera, Distortion, Intrinsics, Rectification};
 use crate::gpu::{Device, Frame, GpuError, Plan, Precision};
 use crate::network::Model;

@@ -7,6 +7,7 @@ mod comparison;
 mod kernel;
 mod random;
 mod report;
+mod stages;
 
 use crate::benchmark::{Adapter, Program, Weights};
 use crate::gpu::{Device, GpuError, Layout, Precision};
