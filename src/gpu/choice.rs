@@ -53,11 +53,11 @@ impl Conv2dKernel {
         match self {
             Self::SubgroupOne | Self::Subgroup => match device.subgroup_size() {
                 Some(8..) => None,
-                Some(size) => Some(format!("subgroups of 8 needed, {size} found")),
-                None => Some("subgroups of 8 needed, none found".into()),
+                Some(size) => Some(format!("subgroups of {size}, 8 needed")),
+                None => Some("no subgroups, 8 needed".into()),
             },
             Self::Cooperative if device.tier() < Tier::CooperativeMatrix => {
-                Some("matrix units needed, 16 x 16 halves summed in f32".into())
+                Some("no matrix units for 16 x 16 halves".into())
             }
             Self::Cooperative | Self::Texture | Self::Tiled(_) | Self::Buffer => None,
         }

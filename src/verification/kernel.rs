@@ -1,12 +1,13 @@
 use std::fmt;
 
+use half::f16;
+
 use super::comparison::Comparison;
 use super::random::Random;
 use super::stages::{self, Source};
 use crate::gpu::{Conv2dKernel, Device, GpuError, Layout, NetworkPlan};
 use crate::network::{Activation, Layer, Network, NetworkError, Operation, Parameters, Shape};
 use crate::reference;
-use half::f16;
 
 /// A kernel of a network's layer, or of what is between the networks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -82,24 +82,23 @@ async fn compare(
 }
 
 async fn cascade(device: &Device, model: &Model, precision: Precision) -> Vec<Check> {
-    let (layout, outcomes) = match device.layout(precision) {
-        Ok(layout) => match cascade::compare(device, model, precision).await {
-            Ok(parts) => (layout, parts.map(|comparisons| judge(&comparisons))),
-            Err(error) => (layout, [(); 3].map(|()| Outcome::failed(&error))),
+    let all = |outcome: Outcome| [(); 3].map(|()| outcome.clone());
+    let layout = device.layout(precision);
+    let outcomes = match &layout {
+        Ok(_) => match cascade::compare(device, model, precision).await {
+            Ok(parts) => parts.map(|comparisons| judge(&comparisons)),
+            Err(error) => all(Outcome::failed(&error)),
         },
-        // Only halves are not for everyone.
-        Err(error) => (
-            Layout::HalfBuffer,
-            [(); 3].map(|()| Outcome::CannotRun {
-                reason: error.to_string(),
-            }),
-        ),
+        Err(error) => all(Outcome::CannotRun {
+            reason: error.to_string(),
+        }),
     };
     let checks = cascade::PARTS.into_iter().zip(outcomes);
     checks
         .map(|(part, outcome)| Check {
             subject: part.to_owned(),
-            layout,
+            // Only halves are not for every device.
+            layout: *layout.as_ref().unwrap_or(&Layout::HalfBuffer),
             precision,
             outcome,
         })

@@ -156,13 +156,23 @@ impl fmt::Display for Outcome {
             Self::Agrees(_) => f.write_str("agrees"),
             Self::Disagrees(figures) => write!(
                 f,
-                "DISAGREES by {:.1e}, {:.1e} allowed",
-                figures.difference, figures.allowed
+                "DISAGREES by {}, {} allowed",
+                short(figures.difference),
+                short(figures.allowed)
             ),
             Self::Unproven(_) => f.write_str("UNPROVEN: a wrong value was not noticed"),
             Self::CannotRun { reason } => write!(f, "cannot run: {reason}"),
             Self::Failed { reason } => write!(f, "FAILED: {reason}"),
         }
+    }
+}
+
+/// With two digits.
+fn short(number: f32) -> String {
+    if number == 0.0 {
+        "0".to_owned()
+    } else {
+        format!("{number:.1e}")
     }
 }
 
@@ -195,7 +205,7 @@ impl fmt::Display for Report {
             if let Some(figures) = check.outcome.figures() {
                 row.push(figures.cases.to_string());
                 let numbers = [figures.difference, figures.allowed, figures.control];
-                row.extend(numbers.map(|number| format!("{number:.1e}")));
+                row.extend(numbers.map(short));
             }
             table.row(row);
         }
