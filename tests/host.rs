@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use common::{ORIENTATIONS, description, difference, joints, model_file, noise};
 use image::{DynamicImage, Rgba, RgbaImage};
-use whereabot::camera::{Camera, Crop, Orientation, Unrectification};
+use whereabot::camera::{Camera, Crop, Unrectification};
 use whereabot::cascade::{
     Estimate, HostLocator, HostOptions, LocateError, Located, Locator, MaskSize, Output, Source,
     Status,
