@@ -72,10 +72,12 @@ impl Kernel {
         ])
     }
 
-    /// The layouts that its tensors can have.
+    /// The layouts in which it is compared.
     pub fn layouts(self) -> &'static [Layout] {
         match self {
             Self::Conv2d(kernel) => kernel.layouts(),
+            // How they write is not how they read: one is enough.
+            Self::Rectify(Source::Texture | Source::Srgb | Source::Nv12) => &[Layout::Buffer],
             _ => &Layout::ALL,
         }
     }
@@ -191,12 +193,12 @@ impl Kernel {
                 (operation, rounding_of_sum(input.len()))
             }
             Self::MaxPool2d => {
-                let size = case.turn(&[2, 3, 1, 5]);
+                let size = case.turn(&[2, 3, 5]);
                 let size = size.min(input.height).min(input.width);
                 (Operation::MaxPool2d { size }, 0.0)
             }
             Self::Upsample2d => {
-                let scale = case.turn(&[2, 3, 1, 4]);
+                let scale = case.turn(&[2, 3, 4]);
                 (Operation::Upsample2d { scale }, 2e-6)
             }
             Self::Concat if case.turn(&[true, false]) => {
