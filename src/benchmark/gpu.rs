@@ -184,7 +184,7 @@ impl Batch {
         let submitted = now_ms();
         device.wait()?;
         let done = now_ms();
-        self.plan.read(device, true, false)?;
+        pollster::block_on(self.plan.read_async(device, true, false))?;
         let read = now_ms();
         let gpu = match timer {
             Timer::Timestamps(timestamps) => timestamps.read(device)?.first().copied(),

@@ -123,7 +123,21 @@ impl Locator {
     /// # Errors
     /// An image of another size than the camera's, or beyond the adapter's limits; a GPU that
     /// failed, was lost or does not answer.
+    #[cfg(not(target_arch = "wasm32"))]
     pub fn locate(
+        &mut self,
+        image: &RgbaImage,
+        camera: &Camera,
+        output: Output,
+    ) -> Result<Estimate, LocateError> {
+        pollster::block_on(self.locate_async(image, camera, output))
+    }
+
+    /// As [`Locator::locate`]: in a browser without blocking, elsewhere blocking all the same.
+    ///
+    /// # Errors
+    /// Those.
+    pub async fn locate_async(
         &mut self,
         image: &RgbaImage,
         camera: &Camera,
@@ -134,7 +148,8 @@ impl Locator {
         let frame = match &mut self.engine {
             Engine::Gpu { device, plan } => {
                 plan.write(device, 0, image, &rectification)?;
-                plan.run(device, !output.mask_only, output.mask)?
+                plan.run_async(device, !output.mask_only, output.mask)
+                    .await?
                     .pop()
                     .ok_or(LocateError::Shape("batch"))?
             }
@@ -149,6 +164,7 @@ impl Locator {
     ///
     /// # Errors
     /// As [`Locator::locate`], and a mask of another size than the model's.
+    #[cfg(not(target_arch = "wasm32"))]
     pub fn joints_with_mask(
         &mut self,
         image: &RgbaImage,

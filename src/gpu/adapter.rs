@@ -83,25 +83,11 @@ impl AdapterReport {
             .get_downlevel_capabilities()
             .flags
             .contains(wgpu::DownlevelFlags::COMPUTE_SHADERS);
-        // What WebGPU guarantees, and the kernels count on.
-        let least = wgpu::Limits::defaults();
-        let unusable = if !compute {
-            Some("no compute shaders".to_owned())
-        } else if limits.max_storage_buffers_per_shader_stage < 4 {
-            Some(format!(
-                "{} storage buffers a shader, 4 needed",
-                limits.max_storage_buffers_per_shader_stage
-            ))
-        } else if limits.max_compute_invocations_per_workgroup
-            < least.max_compute_invocations_per_workgroup
-        {
-            Some(format!(
-                "{} invocations a workgroup, {} needed",
-                limits.max_compute_invocations_per_workgroup,
-                least.max_compute_invocations_per_workgroup
-            ))
-        } else {
-            None
+        let short = needs(&limits).find(|(_, needed, allowed)| allowed < needed);
+        let unusable = match short {
+            _ if !compute => Some("no compute shaders".to_owned()),
+            Some((what, needed, allowed)) => Some(format!("{allowed} {what}, {needed} needed")),
+            None => None,
         };
         Self {
             info: adapter.get_info(),
@@ -109,6 +95,35 @@ impl AdapterReport {
             unusable,
         }
     }
+}
+
+/// What every kernel counts on, of what WebGPU guarantees: name, how much is needed, and how much of
+/// `limits` there is.
+pub(super) fn needs(limits: &wgpu::Limits) -> impl Iterator<Item = (&'static str, u32, u32)> {
+    let least = wgpu::Limits::defaults();
+    [
+        (
+            "storage buffers a shader",
+            4,
+            limits.max_storage_buffers_per_shader_stage,
+        ),
+        (
+            "storage textures a shader",
+            4,
+            limits.max_storage_textures_per_shader_stage,
+        ),
+        (
+            "invocations a workgroup",
+            least.max_compute_invocations_per_workgroup,
+            limits.max_compute_invocations_per_workgroup,
+        ),
+        (
+            "bytes of workgroup memory",
+            least.max_compute_workgroup_storage_size,
+            limits.max_compute_workgroup_storage_size,
+        ),
+    ]
+    .into_iter()
 }
 
 /// Which adapter is used, and why.
@@ -125,47 +140,45 @@ pub struct Choice {
 /// # Errors
 /// [`GpuError::UnknownBackend`].
 #[allow(clippy::type_complexity)]
+#[cfg(not(target_arch = "wasm32"))]
 pub fn list_adapters(
     request: &AdapterRequest,
 ) -> Result<(Vec<AdapterReport>, Result<Choice, GpuError>), GpuError> {
-    let (_, adapters) = enumerate(request.backends()?);
+    let adapters = pollster::block_on(enumerate(request.backends()?));
     let reports: Vec<_> = adapters.iter().map(AdapterReport::of).collect();
     let choice = choose(&reports, request);
     Ok((reports, choice))
 }
 
 /// The adapter that `request` leads to.
-pub(super) fn open(
-    request: &AdapterRequest,
-) -> Result<(wgpu::Instance, wgpu::Adapter, Choice), GpuError> {
+pub(super) async fn open(request: &AdapterRequest) -> Result<(wgpu::Adapter, Choice), GpuError> {
     let backends = request.backends()?;
     // Without a wish, GL is looked at only where there is nothing better: opening it is slow, and
     // noisy on a machine without a display.
     if *request == AdapterRequest::default()
-        && let Ok(found) = open_among(Backends::PRIMARY, request)
+        && let Ok(found) = open_among(Backends::PRIMARY, request).await
     {
         return Ok(found);
     }
-    open_among(backends, request)
+    open_among(backends, request).await
 }
 
-fn open_among(
+async fn open_among(
     backends: Backends,
     request: &AdapterRequest,
-) -> Result<(wgpu::Instance, wgpu::Adapter, Choice), GpuError> {
-    let (instance, mut adapters) = enumerate(backends);
+) -> Result<(wgpu::Adapter, Choice), GpuError> {
+    let mut adapters = enumerate(backends).await;
     let reports: Vec<_> = adapters.iter().map(AdapterReport::of).collect();
     let choice = choose(&reports, request)?;
-    Ok((instance, adapters.swap_remove(choice.index), choice))
+    Ok((adapters.swap_remove(choice.index), choice))
 }
 
-fn enumerate(backends: Backends) -> (wgpu::Instance, Vec<wgpu::Adapter>) {
+async fn enumerate(backends: Backends) -> Vec<wgpu::Adapter> {
     let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
         backends,
         ..wgpu::InstanceDescriptor::new_without_display_handle()
     });
-    let adapters = pollster::block_on(instance.enumerate_adapters(backends));
-    (instance, adapters)
+    instance.enumerate_adapters(backends).await
 }
 
 fn choose(reports: &[AdapterReport], request: &AdapterRequest) -> Result<Choice, GpuError> {

@@ -102,7 +102,7 @@ pub(super) fn conv2d(
     candidates.retain(|kernel| kernel.runs_on(device) && kernel.serves(conv));
     let chosen = match only {
         Some(only) => candidates.contains(&only).then_some(only),
-        None => match device.tuner().choose(device, conv, &candidates)? {
+        None => match tuned(device, conv, &candidates)? {
             Some(fastest) => Some(fastest),
             None => candidates
                 .into_iter()
@@ -115,6 +115,21 @@ pub(super) fn conv2d(
             layer: conv.label.to_owned(),
             wanted: only.map_or("conv2d".into(), |only| only.to_string()),
         }),
+    }
+}
+
+/// What the device's tuner finds to be the fastest; `None` in a browser, where nothing can be waited for.
+fn tuned(
+    device: &Device,
+    conv: &Conv2d<'_>,
+    candidates: &[Conv2dKernel],
+) -> Result<Option<Conv2dKernel>, GpuError> {
+    #[cfg(not(target_arch = "wasm32"))]
+    return device.tuner().choose(device, conv, candidates);
+    #[cfg(target_arch = "wasm32")]
+    {
+        let _ = (device, conv, candidates);
+        Ok(None)
     }
 }
 

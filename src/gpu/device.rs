@@ -1,27 +1,33 @@
 use std::collections::HashMap;
 use std::fmt;
-use std::sync::{Arc, Mutex, PoisonError, mpsc};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use super::adapter::{self, AdapterRequest, Choice};
+use super::loss::Loss;
+use super::mapping::Mapping;
+#[cfg(not(target_arch = "wasm32"))]
 use super::tuner::Tuner;
 use super::{GpuError, Layout, Precision, Tier};
 
-/// A wgpu device and queue of our own, whose errors come back as values.
+/// A wgpu device and queue, whose errors come back as values.
 ///
-/// It installs its own handler for errors that no scope catches, and for the loss of the device:
-/// both are kept and given to the next caller of [`Device::check`].
+/// One of our own ([`Device::open`]) has our handlers for errors that no scope catches and for the loss
+/// of the device: both are kept and given to the next caller of [`Device::check`]. A host's
+/// ([`Device::from_host`]) keeps the host's handlers; its loss is found out by asking.
 pub struct Device {
     device: wgpu::Device,
     queue: wgpu::Queue,
     info: wgpu::AdapterInfo,
     tier: Tier,
     halves: bool,
+    #[cfg(not(target_arch = "wasm32"))]
     tuner: Tuner,
-    choice: Choice,
+    choice: Option<Choice>,
     fault: Arc<Mutex<Option<GpuError>>>,
+    /// For a host's device.
+    loss: Option<Loss>,
     pipelines: Mutex<HashMap<PipelineKey, wgpu::ComputePipeline>>,
-    _instance: wgpu::Instance,
 }
 
 /// A kernel's text, its entry point, and the bits of its constants.
@@ -54,8 +60,17 @@ impl Device {
     ///
     /// # Errors
     /// No adapter, an unknown one, or one that gives no device.
+    #[cfg(not(target_arch = "wasm32"))]
     pub fn open(request: &AdapterRequest) -> Result<Self, GpuError> {
-        let (instance, adapter, choice) = adapter::open(request)?;
+        pollster::block_on(Self::open_async(request))
+    }
+
+    /// Opens the adapter that `request` leads to; in a browser, the one that it offers.
+    ///
+    /// # Errors
+    /// No adapter, an unknown one, or one that gives no device.
+    pub async fn open_async(request: &AdapterRequest) -> Result<Self, GpuError> {
+        let (adapter, choice) = adapter::open(request).await?;
         let info = adapter.get_info();
         let tier = Tier::of(&adapter);
         let mut features = adapter.features() & Self::FEATURES;
@@ -69,17 +84,19 @@ impl Device {
                 experimental = unsafe { wgpu::ExperimentalFeatures::enabled() };
             }
         }
-        let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
-            label: Some("whereabot"),
-            required_features: features,
-            experimental_features: experimental,
-            required_limits: adapter.limits(),
-            ..Default::default()
-        }))
-        .map_err(|e| GpuError::Request {
-            adapter: info.name.clone(),
-            reason: e.to_string(),
-        })?;
+        let (device, queue) = adapter
+            .request_device(&wgpu::DeviceDescriptor {
+                label: Some("whereabot"),
+                required_features: features,
+                experimental_features: experimental,
+                required_limits: adapter.limits(),
+                ..Default::default()
+            })
+            .await
+            .map_err(|e| GpuError::Request {
+                adapter: info.name.clone(),
+                reason: e.to_string(),
+            })?;
         let fault = Arc::new(Mutex::new(None));
         let keep = |fault: &Arc<Mutex<Option<GpuError>>>| {
             let fault = Arc::clone(fault);
@@ -103,15 +120,43 @@ impl Device {
                 .get_downlevel_capabilities()
                 .flags
                 .contains(wgpu::DownlevelFlags::SHADER_F16_IN_F32),
+            #[cfg(not(target_arch = "wasm32"))]
             tuner: Tuner::default(),
             device,
             queue,
             info,
-            choice,
+            choice: Some(choice),
             fault,
+            loss: None,
             pipelines: Mutex::default(),
-            _instance: instance,
         })
+    }
+
+    /// Uses a host's device and queue, with whatever features and limits the host enabled; WebGPU's
+    /// defaults are enough. The host's error handlers, and error scopes that it has open, see nothing of
+    /// it; nothing is submitted but by calls that say so.
+    ///
+    /// # Errors
+    /// [`GpuError::Limit`] where the device has less than WebGPU's defaults of what every kernel needs.
+    pub fn from_host(device: wgpu::Device, queue: wgpu::Queue) -> Result<Self, GpuError> {
+        let host = Self {
+            tier: Tier::with(device.features()),
+            halves: true,
+            #[cfg(not(target_arch = "wasm32"))]
+            tuner: Tuner::default(),
+            info: device.adapter_info(),
+            choice: None,
+            fault: Arc::default(),
+            loss: Some(Loss::new(&device)),
+            pipelines: Mutex::default(),
+            device,
+            queue,
+        };
+        let limits = host.device.limits();
+        for (what, needed, allowed) in adapter::needs(&limits) {
+            host.require(what, needed.into(), allowed.into())?;
+        }
+        Ok(host)
     }
 
     /// The device itself.
@@ -154,14 +199,15 @@ impl Device {
         usable.then_some(self.info.subgroup_min_size)
     }
 
-    /// Why this adapter was chosen.
-    pub fn choice(&self) -> &Choice {
-        &self.choice
+    /// Why this adapter was chosen; `None` where a host did.
+    pub fn choice(&self) -> Option<&Choice> {
+        self.choice.as_ref()
     }
 
     /// Lets plans find the fastest kernels for their layers by timing them, which takes `limit`, all plans
     /// together, and at most one kernel's compilation and timing more. `memory` is what [`Device::tuning`] gave in an earlier process; what is of
     /// another adapter, driver or version of this library, or no such thing at all, is passed over.
+    #[cfg(not(target_arch = "wasm32"))]
     #[must_use]
     pub fn tuned(mut self, limit: Duration, memory: &[u8]) -> Self {
         self.tuner = Tuner::new(limit, &self.info, memory);
@@ -170,10 +216,12 @@ impl Device {
 
     /// What was found to be the fastest, to be remembered for [`Device::tuned`]; `None` where nothing new
     /// was found since the last call.
+    #[cfg(not(target_arch = "wasm32"))]
     pub fn tuning(&self) -> Option<Vec<u8>> {
         self.tuner.memory(&self.info)
     }
 
+    #[cfg(not(target_arch = "wasm32"))]
     pub(super) fn tuner(&self) -> &Tuner {
         &self.tuner
     }
@@ -228,7 +276,13 @@ impl Device {
     /// # Errors
     /// That fault. A device that had one answers it for ever: what it computed since is no result.
     pub fn check(&self) -> Result<(), GpuError> {
-        match &*self.fault.lock().unwrap_or_else(PoisonError::into_inner) {
+        let mut fault = self.fault.lock().unwrap_or_else(PoisonError::into_inner);
+        if fault.is_none() && self.loss.as_ref().is_some_and(Loss::happened) {
+            *fault = Some(GpuError::Lost(
+                "the host's device is no longer valid".into(),
+            ));
+        }
+        match &*fault {
             Some(error) => Err(error.clone()),
             None => Ok(()),
         }
@@ -240,13 +294,20 @@ impl Device {
     /// What `make` answers, validation failures, and too little memory.
     pub fn scoped<T>(&self, make: impl FnOnce() -> Result<T, GpuError>) -> Result<T, GpuError> {
         self.check()?;
-        let memory = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
-        let validation = self.device.push_error_scope(wgpu::ErrorFilter::Validation);
+        // A browser says what it thinks of calls later: of our own device to its handler.
+        #[cfg(target_arch = "wasm32")]
         let made = make();
-        let errors = [validation.pop(), memory.pop()].map(pollster::block_on);
-        if let Some(error) = errors.into_iter().flatten().next() {
-            return Err(convert(error));
-        }
+        #[cfg(not(target_arch = "wasm32"))]
+        let made = {
+            let memory = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
+            let validation = self.device.push_error_scope(wgpu::ErrorFilter::Validation);
+            let made = make();
+            let errors = [validation.pop(), memory.pop()].map(pollster::block_on);
+            if let Some(error) = errors.into_iter().flatten().next() {
+                return Err(convert(error));
+            }
+            made
+        };
         self.check()?;
         made
     }
@@ -271,6 +332,7 @@ impl Device {
     ///
     /// # Errors
     /// [`GpuError::Timeout`] after [`Device::TIMEOUT`], and any fault of the device.
+    #[cfg(not(target_arch = "wasm32"))]
     pub fn wait(&self) -> Result<(), GpuError> {
         let polled = self.device.poll(wgpu::PollType::Wait {
             submission_index: None,
@@ -284,35 +346,65 @@ impl Device {
         }
     }
 
+    /// As [`Device::wait`]: in a browser without blocking, elsewhere blocking all the same.
+    ///
+    /// # Errors
+    /// Those.
+    pub async fn wait_async(&self) -> Result<(), GpuError> {
+        #[cfg(not(target_arch = "wasm32"))]
+        return self.wait();
+        #[cfg(target_arch = "wasm32")]
+        {
+            let (mapping, callback) = Mapping::new();
+            self.queue.on_submitted_work_done(move || callback(Ok(())));
+            mapping.finish(self).await?;
+            self.check()
+        }
+    }
+
     /// Maps `buffer`, gives its bytes to `read`, and unmaps it. Waits for what was submitted before.
     ///
     /// # Errors
     /// As [`Device::wait`], and whatever keeps the buffer from being mapped.
+    #[cfg(not(target_arch = "wasm32"))]
     pub fn read<T>(
         &self,
         buffer: &wgpu::Buffer,
         read: impl FnOnce(&[u8]) -> T,
     ) -> Result<T, GpuError> {
-        let (sender, receiver) = mpsc::channel();
-        buffer.map_async(wgpu::MapMode::Read, .., move |result| {
-            // The receiver is gone only where the wait failed, and then nobody listens.
-            let _ = sender.send(result);
-        });
-        self.wait()?;
-        // Where threads share the device, another one's wait may be the one that runs the callback.
-        match receiver.recv_timeout(Self::TIMEOUT) {
-            Ok(Ok(())) => {}
-            Ok(Err(e)) => return Err(GpuError::Lost(e.to_string())),
-            Err(_) => return Err(GpuError::Timeout(Self::TIMEOUT)),
-        }
-        let view = buffer
-            .get_mapped_range(..)
-            .map_err(|e| GpuError::Validation(e.to_string()))?;
-        let value = read(&view);
-        drop(view);
-        buffer.unmap();
-        Ok(value)
+        pollster::block_on(self.read_async(buffer, read))
     }
+
+    /// As [`Device::read`]: in a browser without blocking, elsewhere blocking all the same.
+    ///
+    /// # Errors
+    /// Those.
+    pub async fn read_async<T>(
+        &self,
+        buffer: &wgpu::Buffer,
+        read: impl FnOnce(&[u8]) -> T,
+    ) -> Result<T, GpuError> {
+        let (mapping, callback) = Mapping::new();
+        buffer.map_async(wgpu::MapMode::Read, .., callback);
+        #[cfg(not(target_arch = "wasm32"))]
+        self.wait()?;
+        mapping.finish(self).await?;
+        mapped(buffer, read)
+    }
+}
+
+/// Gives the bytes of a mapped `buffer` to `read`, and unmaps it.
+pub(super) fn mapped<T>(
+    buffer: &wgpu::Buffer,
+    read: impl FnOnce(&[u8]) -> T,
+) -> Result<T, GpuError> {
+    let view = buffer
+        .get_mapped_range(..)
+        .map_err(|e| GpuError::Validation(e.to_string()))?;
+    let value = read(&view);
+    drop(view);
+    buffer.unmap();
+    Ok(value)
 }
 
 fn convert(error: wgpu::Error) -> GpuError {

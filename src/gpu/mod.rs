@@ -11,6 +11,8 @@ mod device;
 mod error;
 mod kernel_text;
 mod layout;
+mod loss;
+mod mapping;
 mod max_pool2d;
 mod network;
 mod overlay;
@@ -22,12 +24,13 @@ mod soft_argmax2d;
 mod step;
 mod tensor;
 mod tier;
+#[cfg(not(target_arch = "wasm32"))]
 mod tuner;
 mod upsample2d;
 
-pub use adapter::{
-    AdapterReport, AdapterRequest, Choice, Wanted, device_type, driver, list_adapters,
-};
+#[cfg(not(target_arch = "wasm32"))]
+pub use adapter::list_adapters;
+pub use adapter::{AdapterReport, AdapterRequest, Choice, Wanted, device_type, driver};
 pub use choice::Conv2dKernel;
 pub use coverage::{Totals, coverage};
 pub use device::Device;

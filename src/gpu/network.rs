@@ -207,11 +207,20 @@ impl NetworkPlan {
     ///
     /// # Errors
     /// As [`Device::wait`].
+    #[cfg(not(target_arch = "wasm32"))]
     pub fn run(&self, device: &Device) -> Result<(), GpuError> {
+        pollster::block_on(self.run_async(device))
+    }
+
+    /// As [`NetworkPlan::run`]: in a browser without blocking, elsewhere blocking all the same.
+    ///
+    /// # Errors
+    /// As [`Device::wait`].
+    pub async fn run_async(&self, device: &Device) -> Result<(), GpuError> {
         let mut encoder = device.wgpu().create_command_encoder(&Default::default());
         self.encode(&mut encoder.begin_compute_pass(&Default::default()));
         device.queue().submit([encoder.finish()]);
-        device.wait()
+        device.wait_async().await
     }
 }
 

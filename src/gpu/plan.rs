@@ -124,7 +124,21 @@ impl Plan {
     ///
     /// # Errors
     /// As [`Device::wait`].
+    #[cfg(not(target_arch = "wasm32"))]
     pub fn run(
+        &self,
+        device: &Device,
+        with_joints: bool,
+        with_mask: bool,
+    ) -> Result<Vec<Frame>, GpuError> {
+        pollster::block_on(self.run_async(device, with_joints, with_mask))
+    }
+
+    /// As [`Plan::run`]: in a browser without blocking, elsewhere blocking all the same.
+    ///
+    /// # Errors
+    /// Those.
+    pub async fn run_async(
         &self,
         device: &Device,
         with_joints: bool,
@@ -133,7 +147,7 @@ impl Plan {
         let mut encoder = device.wgpu().create_command_encoder(&Default::default());
         self.encode(&mut encoder, with_joints, with_mask, None);
         device.queue().submit([encoder.finish()]);
-        self.read(device, with_joints, with_mask)
+        self.read_async(device, with_joints, with_mask).await
     }
 
     /// Records a frame: one compute pass, which writes `timestamps`, and the copies of its results.
@@ -165,10 +179,11 @@ impl Plan {
     }
 
     /// Waits for a frame that was submitted as [`Plan::encode`] recorded it: the result of each image.
+    /// In a browser without blocking, elsewhere blocking all the same.
     ///
     /// # Errors
     /// As [`Device::wait`].
-    pub fn read(
+    pub async fn read_async(
         &self,
         device: &Device,
         with_joints: bool,
@@ -177,7 +192,7 @@ impl Plan {
         let after_joints = self.joint.output().staging_size();
         let shape = self.image.shape;
         let (width, height) = (shape.width as u32, shape.height as u32);
-        let mut frames = device.read(&self.results, |bytes| {
+        let frames = device.read_async(&self.results, |bytes| {
             let (joints, totals) = bytes.split_at(after_joints as usize);
             let joints = self.joints_in(joints);
             totals
@@ -190,9 +205,11 @@ impl Plan {
                     mask: Vec::new(),
                 })
                 .collect::<Vec<_>>()
-        })?;
+        });
+        let mut frames = frames.await?;
         if with_mask {
-            let values = device.read(&self.masks, |bytes| self.mask.output().values(bytes))?;
+            let values = device.read_async(&self.masks, |bytes| self.mask.output().values(bytes));
+            let values = values.await?;
             let plane = shape.height * shape.width;
             for (frame, mask) in frames.iter_mut().zip(values.chunks_exact(plane)) {
                 frame.mask = mask.to_vec();
@@ -206,6 +223,7 @@ impl Plan {
     ///
     /// # Errors
     /// As [`Device::wait`], and another number of values.
+    #[cfg(not(target_arch = "wasm32"))]
     pub fn run_with_masks(
         &self,
         device: &Device,

@@ -250,6 +250,7 @@ impl Tensor {
     }
 
     /// Writes numbers in [-1, 1), some of which repeat, at the queue's next submission. For buffers.
+    #[cfg(not(target_arch = "wasm32"))]
     pub(super) fn fill(&self, device: &Device) {
         let Memory::Buffer { buffer, offset, .. } = &self.memory else {
             return;
@@ -273,6 +274,7 @@ impl Tensor {
     }
 
     /// Numbers from all over it, as they lie in memory. For buffers. Waits for what was submitted before.
+    #[cfg(not(target_arch = "wasm32"))]
     pub(super) fn sample(&self, device: &Device) -> Result<Vec<f32>, GpuError> {
         const PIECES: u64 = 64;
         const PIECE: u64 = 1 << 14;
@@ -306,12 +308,22 @@ impl Tensor {
     ///
     /// # Errors
     /// As [`Device::read`].
+    #[cfg(not(target_arch = "wasm32"))]
     pub fn read(&self, device: &Device) -> Result<Vec<f32>, GpuError> {
+        pollster::block_on(self.read_async(device))
+    }
+
+    /// As [`Tensor::read`]: in a browser without blocking, elsewhere blocking all the same.
+    ///
+    /// # Errors
+    /// As [`Device::read`].
+    pub async fn read_async(&self, device: &Device) -> Result<Vec<f32>, GpuError> {
         let staging = device.scoped(|| Ok(staging_buffer(device, self.staging_size())))?;
         let mut encoder = device.wgpu().create_command_encoder(&Default::default());
         self.copy_to(&mut encoder, &staging, 0);
         device.queue().submit([encoder.finish()]);
-        device.read(&staging, |bytes| self.values(bytes))
+        let values = device.read_async(&staging, |bytes| self.values(bytes));
+        values.await
     }
 
     /// Bytes that [`Self::copy_to`] writes.

@@ -16,16 +16,25 @@ pub enum Tier {
 impl Tier {
     /// The tier that an adapter reaches.
     pub fn of(adapter: &wgpu::Adapter) -> Self {
-        use wgpu::Features as F;
         let features = adapter.features();
-        if !features.contains(F::SHADER_F16) {
+        let matrix = wgpu::Features::EXPERIMENTAL_COOPERATIVE_MATRIX;
+        match Self::with(features) {
+            Self::Subgroups if features.contains(matrix) && matrices(adapter) => {
+                Self::CooperativeMatrix
+            }
+            tier => tier,
+        }
+    }
+
+    /// The tier of a device of which only `features` are known. An adapter alone tells which matrices it
+    /// multiplies.
+    pub fn with(features: wgpu::Features) -> Self {
+        if !features.contains(wgpu::Features::SHADER_F16) {
             Self::Baseline
-        } else if !features.contains(F::SUBGROUP) {
+        } else if !features.contains(wgpu::Features::SUBGROUP) {
             Self::F16
-        } else if !features.contains(F::EXPERIMENTAL_COOPERATIVE_MATRIX) || !matrices(adapter) {
-            Self::Subgroups
         } else {
-            Self::CooperativeMatrix
+            Self::Subgroups
         }
     }
 }
