@@ -14,6 +14,7 @@ fn main() -> anyhow::Result<()> {
         .input_path(&input)
         .web(true)?
         .typescript(false)
+        .omit_default_module_path(false)
         .generate(&output)
         .with_context(|| format!("{input}: no bindings"))
 }
