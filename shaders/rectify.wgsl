@@ -2,7 +2,8 @@
 //
 // An output pixel is the mean of a grid of bilinear samples over its footprint in the source, as
 // many as the footprint has pixels: nothing is skipped when the image shrinks. What the source does
-// not show is black. Formulas: OpenCV's camera models; see `camera::Rectification`.
+// not show is black. Formulas: OpenCV's camera models; see `camera::Rectification`. What the source is
+// made of is in the `rectify_*` file that stands behind this one: `source_at` gives a texel's colour.
 
 struct Rectification {
     // 1 / fx, 1 / fy, cx, cy of the canonical camera
@@ -23,9 +24,12 @@ struct Rectification {
     max_radius: f32,
     // which image of the batch is written
     index: u32,
+    // where the pixels of the source lie in its texture: pixel (0, 0), and the next ones from there
+    across: vec2<i32>,
+    down: vec2<i32>,
+    origin: vec2<i32>,
 }
 
-@group(0) @binding(3) var source: texture_storage_2d<rgba8unorm, read>;
 @group(0) @binding(4) var<uniform> params: Rectification;
 
 // Where a ray at z = 1 lands in the source, in pixels.
@@ -60,7 +64,9 @@ fn ray_of(pixel: vec2<f32>) -> vec2<f32> {
 
 fn load(at: vec2<i32>) -> vec3<f32> {
     let inside = all(at >= vec2(0)) && all(at < vec2<i32>(params.size));
-    return select(vec3(0.0), textureLoad(source, clamp(at, vec2(0), vec2<i32>(params.size) - 1)).rgb, inside);
+    let near = clamp(at, vec2(0), vec2<i32>(params.size) - 1);
+    let texel = params.origin + params.across * near.x + params.down * near.y;
+    return select(vec3(0.0), source_at(texel), inside);
 }
 
 // Bilinear, as if black pixels lay round the source: without a step at its border.

@@ -9,6 +9,7 @@ mod known;
 use std::path::Path;
 
 use common::{description, model_file};
+use image::RgbaImage;
 use known::{XYZ, command, model};
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -299,7 +300,16 @@ fn without_timestamps_the_wall_clock_is_used_and_named() {
 #[test]
 fn a_plan_hands_out_its_steps_in_order_with_all_their_work() {
     let model = Model::from_bytes(&model_file(&description(32, 24, 4), 1), "random").unwrap();
-    let plan = Plan::new(&common::device(), &model, 3, Precision::F32).unwrap();
+    let device = common::device();
+    let mut plan = Plan::new(&device, &model, 3, Precision::F32).unwrap();
+    // What rectifies is made for the kind of source.
+    assert_eq!(plan.steps(true).next().unwrap().label(), "mask.conv1");
+    let camera = Camera::from_hfov(40, 30, 1.0);
+    let params = Rectification::new(&camera, &model.description.camera, 32, 24);
+    for index in 0..3 {
+        let image = RgbaImage::new(40, 30);
+        plan.write(&device, index, &image, &params).unwrap();
+    }
     let macs = |joints| {
         let joint = if joints {
             model.joint_network.macs()
@@ -367,15 +377,30 @@ fn the_fastest_kernels_are_remembered_in_the_users_cache() {
         String::from_utf8(output.stdout).unwrap()
     };
     assert!(run(&["--no-tuning"]).contains("f16"));
-    assert!(!folder.path().join(ours).exists());
-    run(&[]);
-    let files: Vec<_> = std::fs::read_dir(folder.path().join(ours))
-        .unwrap()
-        .map(|entry| entry.unwrap().path())
-        .collect();
-    let [file] = files.as_slice() else {
-        panic!("{files:?}")
+    let file = |begin: &str| {
+        let files = std::fs::read_dir(folder.path().join(ours))
+            .into_iter()
+            .flatten();
+        let mut paths = files.map(|entry| entry.unwrap().path());
+        paths.find(|path| {
+            path.file_name()
+                .unwrap()
+                .to_str()
+                .unwrap()
+                .starts_with(begin)
+        })
     };
+    assert!(file("tuning").is_none());
+    // What the driver compiled is kept where the backend gives it; what is damaged is compiled again.
+    let pipelines = file("pipelines");
+    if let Some(file) = &pipelines {
+        std::fs::write(file, "damaged").unwrap();
+    }
+    run(&[]);
+    if let Some(file) = &pipelines {
+        assert!(std::fs::read(file).unwrap().len() > 8);
+    }
+    let file = &file("tuning").unwrap();
     let first = std::fs::read_to_string(file).unwrap();
     assert!(first.contains("conv2d_"), "{first}");
     // What is known stays, whatever was left to find out; what is corrupt is found out again.

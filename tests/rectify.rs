@@ -3,11 +3,11 @@
 
 mod common;
 
-use common::{cases, device, difference, noise};
-use image::{Rgba, RgbaImage};
+use common::{cases, device, difference, noise, run_step};
+use image::{DynamicImage, Rgba, RgbaImage};
 use proptest::prelude::*;
-use whereabot::camera::{Camera, Distortion, Intrinsics, Rectification};
-use whereabot::gpu::{Rectify, Tensor};
+use whereabot::camera::{Camera, Crop, Distortion, Intrinsics, Orientation, Rectification, Texels};
+use whereabot::gpu::{Planes, Rectify, Tensor, Yuv};
 use whereabot::network::Shape;
 use whereabot::reference;
 
@@ -23,13 +23,53 @@ fn canonical(width: u32, height: u32) -> Intrinsics {
 fn on_gpu(image: &RgbaImage, params: &Rectification, width: usize, height: usize) -> Vec<f32> {
     let device = device();
     let output = Tensor::new(&device, "output", Shape::new(3, height, width), 1).unwrap();
-    let mut rectify = device.scoped(|| Rectify::new(&device, &output)).unwrap();
+    let mut rectify = device.scoped(|| Ok(Rectify::new(&device))).unwrap();
     rectify.write(&device, &output, image, params).unwrap();
-    let mut encoder = device.wgpu().create_command_encoder(&Default::default());
-    let step = rectify.step();
-    step.encode(&mut encoder.begin_compute_pass(&Default::default()));
-    device.queue().submit([encoder.finish()]);
+    run_step(&device, rectify.step().unwrap());
     output.read(&device).unwrap()
+}
+
+/// The same of a host's textures, rectified into 64 x 53.
+fn of_planes(planes: &Planes, params: &Rectification) -> Vec<f32> {
+    let device = device();
+    let output = Tensor::new(&device, "output", Shape::new(3, 53, 64), 1).unwrap();
+    let mut rectify = device.scoped(|| Ok(Rectify::new(&device))).unwrap();
+    rectify.bind(&device, &output, planes, params).unwrap();
+    run_step(&device, rectify.step().unwrap());
+    output.read(&device).unwrap()
+}
+
+fn texture(
+    format: wgpu::TextureFormat,
+    [width, height]: [u32; 2],
+    bytes: &[u8],
+) -> wgpu::TextureView {
+    let device = device();
+    let texture = device.wgpu().create_texture(&wgpu::TextureDescriptor {
+        label: None,
+        size: wgpu::Extent3d {
+            width,
+            height,
+            depth_or_array_layers: 1,
+        },
+        mip_level_count: 1,
+        sample_count: 1,
+        dimension: wgpu::TextureDimension::D2,
+        format,
+        usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
+        view_formats: &[],
+    });
+    device.queue().write_texture(
+        texture.as_image_copy(),
+        bytes,
+        wgpu::TexelCopyBufferLayout {
+            offset: 0,
+            bytes_per_row: Some(bytes.len() as u32 / height),
+            rows_per_image: None,
+        },
+        texture.size(),
+    );
+    texture.create_view(&Default::default())
 }
 
 /// Grain on slow waves: steep enough that a wrong position shows.
@@ -229,4 +269,123 @@ fn more_workgroups_than_one_dimension_holds() {
             .iter()
             .any(|&v| v > 0.1)
     );
+}
+
+#[test]
+fn every_format_shows_the_same() {
+    use wgpu::TextureFormat as F;
+    let image = picture(90, 70, 1);
+    let camera = Camera::from_hfov(90, 70, 1.2);
+    let params = Rectification::new(&camera, &canonical(64, 53), 64, 53);
+    let expected = reference::rectify(&image, &params, 53, 64);
+    let mut swapped = image.clone();
+    swapped.pixels_mut().for_each(|pixel| pixel.0.swap(0, 2));
+    for (format, right, wrong) in [
+        (F::Rgba8Unorm, &image, &swapped),
+        (F::Rgba8UnormSrgb, &image, &swapped),
+        (F::Bgra8Unorm, &swapped, &image),
+        (F::Bgra8UnormSrgb, &swapped, &image),
+    ] {
+        let off = |image: &RgbaImage| {
+            let found = of_planes(&Planes::Rgba(texture(format, [90, 70], image)), &params);
+            difference(&found, expected.data()).unwrap()
+        };
+        // WebGPU lets a driver decode sRGB to within half a step of eight bits.
+        let allowed = if format.is_srgb() { 0.6 / 255.0 } else { 2e-4 };
+        assert!(off(right) <= allowed, "{format:?}: {}", off(right));
+        // Negative control: red for blue.
+        assert!(off(wrong) > 0.1, "{format:?}");
+    }
+}
+
+/// Luma and chroma of an image, each four pixels of one colour.
+fn nv12(image: &RgbaImage, encoding: Yuv) -> (Vec<u8>, Vec<u8>) {
+    let (red, blue) = match encoding {
+        Yuv::Bt601 | Yuv::Bt601Full => (0.299, 0.114),
+        Yuv::Bt709 | Yuv::Bt709Full => (0.2126, 0.0722),
+    };
+    let full = matches!(encoding, Yuv::Bt601Full | Yuv::Bt709Full);
+    let (luma_span, chroma_span, black) = if full {
+        (255.0, 255.0, 0.0)
+    } else {
+        (219.0, 224.0, 16.0)
+    };
+    let (mut luma, mut chroma) = (Vec::new(), Vec::new());
+    for (x, y, pixel) in image.enumerate_pixels() {
+        let [r, g, b] = [0, 1, 2].map(|c| f64::from(pixel.0[c]) / 255.0);
+        let value = red * r + (1.0 - red - blue) * g + blue * b;
+        luma.push((black + luma_span * value).round() as u8);
+        if x % 2 == 0 && y % 2 == 0 {
+            let cb = (b - value) / (2.0 * (1.0 - blue));
+            let cr = (r - value) / (2.0 * (1.0 - red));
+            chroma.extend([cb, cr].map(|c| (128.0 + chroma_span * c).round() as u8));
+        }
+    }
+    (luma, chroma)
+}
+
+#[test]
+fn nv12_shows_the_same_in_each_encoding() {
+    use wgpu::TextureFormat as F;
+    let blocks = picture(31, 24, 1);
+    let image = RgbaImage::from_fn(61, 47, |x, y| *blocks.get_pixel(x / 2, y / 2));
+    let camera = Camera::from_hfov(61, 47, 1.2);
+    let params = Rectification::new(&camera, &canonical(64, 53), 64, 53);
+    let expected = reference::rectify(&image, &params, 53, 64);
+    let off = |written, read| {
+        let (luma, chroma) = nv12(&image, written);
+        let planes = Planes::Nv12 {
+            luma: texture(F::R8Unorm, [61, 47], &luma),
+            chroma: texture(F::Rg8Unorm, [31, 24], &chroma),
+            encoding: read,
+        };
+        difference(&of_planes(&planes, &params), expected.data()).unwrap()
+    };
+    let all = [Yuv::Bt601, Yuv::Bt601Full, Yuv::Bt709, Yuv::Bt709Full];
+    for (index, written) in all.into_iter().enumerate() {
+        // Luma and chroma were rounded to 219 or 224 steps.
+        let right = off(written, written);
+        assert!(right < 0.009, "{written:?}: {right}");
+        // Negative control: another encoding.
+        let wrong = off(written, all[(index + 1) % 4]);
+        assert!(wrong > 0.02, "{written:?}: {wrong}");
+    }
+}
+
+const ORIENTATIONS: [Orientation; 8] = [
+    Orientation::NoTransforms,
+    Orientation::Rotate90,
+    Orientation::Rotate180,
+    Orientation::Rotate270,
+    Orientation::FlipHorizontal,
+    Orientation::FlipVertical,
+    Orientation::Rotate90FlipH,
+    Orientation::Rotate270FlipH,
+];
+
+proptest! {
+    #![proptest_config(cases(24))]
+
+    #[test]
+    fn a_part_of_a_turned_image_is_what_it_is_upright(
+        (width, height) in (1_u32..90, 1_u32..90),
+        (left, top, right, bottom) in (0_u32..9, 0_u32..9, 0_u32..9, 0_u32..9),
+        turn in 0_usize..8,
+    ) {
+        let orientation = ORIENTATIONS[turn];
+        let crop = Crop { x: left, y: top, width, height };
+        let stored = picture(left + width + right, top + height + bottom, 5);
+        let part = image::imageops::crop_imm(&stored, left, top, width, height).to_image();
+        let mut upright = DynamicImage::from(part);
+        upright.apply_orientation(orientation);
+        let upright = upright.to_rgba8();
+        let camera = Camera::from_hfov(upright.width(), upright.height(), 1.1);
+        let plain = Rectification::new(&camera, &canonical(64, 53), 64, 53);
+        let turned = Rectification { texels: Texels::new(crop, orientation), ..plain };
+        let expected = reference::rectify(&upright, &plain, 53, 64);
+        let on_cpu = reference::rectify(&stored, &turned, 53, 64);
+        prop_assert_eq!(&on_cpu, &expected);
+        let found = difference(&on_gpu(&stored, &turned, 64, 53), expected.data()).unwrap();
+        prop_assert!(found <= 2e-4, "{}", found);
+    }
 }

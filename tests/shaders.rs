@@ -16,7 +16,7 @@ use Layout::{Buffer, HalfBuffer};
 
 /// What the library composes from the files in `shaders/`, and the constants that these want in their text:
 /// a file that nobody lists is not tested. Some have no layout: they bind their textures themselves, or draw.
-const KERNELS: [Kernel; 19] = [
+const KERNELS: [Kernel; 24] = [
     (&["back_project"], &Layout::ALL, &[]),
     (&["concat"], &Layout::ALL, &[]),
     (
@@ -51,14 +51,23 @@ const KERNELS: [Kernel; 19] = [
     ),
     (&["coverage"], &Layout::ALL, &[]),
     (&["dense"], &Layout::ALL, &[]),
+    (
+        &["estimate_layout", "estimate"],
+        &Layout::ALL,
+        &[("JOINTS", 6)],
+    ),
     (&["max_pool2d"], &Layout::ALL, &[]),
     (&["overlay"], &Layout::ALL, &[]),
     (&["probe_arithmetic"], &[], &[]),
     (&["probe_copy"], &[], &[]),
-    (&["rectify"], &Layout::ALL, &[]),
+    (&["rectify", "rectify_storage"], &Layout::ALL, &[]),
+    (&["rectify", "rectify_texture"], &Layout::ALL, &[]),
+    (&["rectify", "rectify_srgb"], &Layout::ALL, &[]),
+    (&["rectify", "rectify_nv12"], &Layout::ALL, &[]),
     (&["render"], &[], &[]),
     (&["sigmoid"], &Layout::ALL, &[]),
     (&["soft_argmax2d"], &Layout::ALL, &[]),
+    (&["unrectify"], &Layout::ALL, &[]),
     (&["upsample2d"], &Layout::ALL, &[]),
 ];
 

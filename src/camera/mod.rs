@@ -5,11 +5,17 @@
 
 mod calibration;
 mod camera_info;
+pub mod graphics;
 mod intrinsics;
 mod lens;
+mod orientation;
 mod rectification;
+mod unrectification;
 
 pub use calibration::{Camera, CameraError};
+pub use image::metadata::Orientation;
 pub use intrinsics::Intrinsics;
 pub use lens::{Distortion, Lens};
+pub use orientation::{Crop, Texels};
 pub use rectification::Rectification;
+pub use unrectification::Unrectification;

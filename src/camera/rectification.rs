@@ -1,6 +1,6 @@
 use bytemuck::{Pod, Zeroable};
 
-use super::{Camera, Distortion, Intrinsics};
+use super::{Camera, Distortion, Intrinsics, Texels};
 
 /// How a camera's image becomes the canonical pinhole image of the networks: what
 /// `shaders/rectify.wgsl` and its reference read, in their layout and precision.
@@ -25,8 +25,12 @@ pub struct Rectification {
     pub max_radius: f32,
     /// Which image of a batch is written.
     pub index: u32,
-    /// Keeps the size a multiple of 16 bytes.
+    /// Keeps what follows at a multiple of 8 bytes.
     pub padding: u32,
+    /// Where the pixels of the source lie in its texture.
+    pub texels: Texels,
+    /// Keeps the size a multiple of 16 bytes.
+    pub padding_end: [u32; 2],
 }
 
 impl Rectification {
@@ -59,6 +63,8 @@ impl Rectification {
             max_radius: source.max_radius().min(1e9) as f32,
             index: 0,
             padding: 0,
+            texels: Texels::PLAIN,
+            padding_end: [0; 2],
         }
     }
 }

@@ -1,3 +1,9 @@
+use super::Output;
+use super::view::View;
+use crate::camera::Lens;
+use crate::gpu::Frame;
+use crate::network::Description;
+
 /// What an image was found to show.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Status {
@@ -49,4 +55,61 @@ pub struct Estimate {
     pub joints: Vec<Joint>,
     /// The mask, where it was asked for.
     pub mask: Option<Mask>,
+}
+
+impl Estimate {
+    /// What a frame of the networks says about the image as given.
+    pub(super) fn new(
+        description: &Description,
+        frame: Frame,
+        view: &View,
+        output: Output,
+    ) -> Self {
+        let (width, height) = (description.input.width, description.input.height);
+        let pixels = width * height;
+        let share = f64::from(frame.coverage.pixels) / f64::from(pixels);
+        let bbox_px = frame.coverage.bbox.and_then(|bbox| view.bbox(bbox));
+
+        let (status, joints) = if frame.coverage.not_finite > 0 {
+            (Status::Invalid, Vec::new())
+        } else if frame.coverage.sure < description.presence.min_sure_pixels(pixels) {
+            (Status::NotFound, Vec::new())
+        } else if output.mask_only {
+            (Status::Found, Vec::new())
+        } else {
+            match joints(&frame.joints, &description.joints, &view.lens) {
+                Some(joints) => (Status::Found, joints),
+                None => (Status::Invalid, Vec::new()),
+            }
+        };
+        Self {
+            status,
+            coverage: view.share_of_image(share),
+            bbox_px,
+            field: view.field,
+            joints,
+            mask: output.mask.then_some(Mask {
+                width,
+                height,
+                probability: frame.mask,
+            }),
+        }
+    }
+}
+
+/// The joints in the camera's image; `None` unless all are finite, in front of the camera and where
+/// its lens can show them.
+fn joints(values: &[f32], names: &[String], lens: &Lens) -> Option<Vec<Joint>> {
+    values
+        .chunks_exact(3)
+        .zip(names)
+        .map(|(xyz, name)| {
+            let xyz_m = [xyz[0], xyz[1], xyz[2]].map(f64::from);
+            Some(Joint {
+                name: name.clone(),
+                xyz_m,
+                px: lens.project(xyz_m)?,
+            })
+        })
+        .collect()
 }

@@ -3,8 +3,8 @@ use std::sync::Arc;
 use image::RgbaImage;
 
 use super::view::View;
-use super::{Estimate, Joint, Mask, Status};
-use crate::camera::{Camera, Lens, Rectification};
+use super::{Estimate, Mask};
+use crate::camera::{Camera, Crop, Rectification, Texels};
 use crate::gpu::{Device, Frame, GpuError, Plan, Precision};
 use crate::network::{Description, Model};
 use crate::reference;
@@ -69,6 +69,22 @@ pub enum LocateError {
         expected: usize,
         /// Values in the mask.
         found: usize,
+    },
+    /// A frame without an image.
+    #[error("image {index} of the batch has no source: give it one before encoding")]
+    NoSource {
+        /// Which image of the batch.
+        index: usize,
+    },
+    /// A part of an image that it does not have.
+    #[error("crop: expected a part of {width} x {height} texels, found {crop:?}")]
+    Crop {
+        /// Columns of the source.
+        width: u32,
+        /// Rows of the source.
+        height: u32,
+        /// What was asked for.
+        crop: Crop,
     },
     /// The networks do not fit together: a defect of this library.
     #[error("{0}: a layer's shape differs from its description")]
@@ -155,7 +171,7 @@ impl Locator {
             }
             Engine::Cpu { model } => run_reference(model, image, &rectification, output)?,
         };
-        Ok(self.estimate(frame, &view, output))
+        Ok(Estimate::new(&self.description, frame, &view, output))
     }
 
     /// Where the joint network puts the joints of the robot that `mask` shows in `image`: what it makes
@@ -213,62 +229,12 @@ impl Locator {
         let input = self.description.input;
         let canonical = self.description.camera;
         let view = match self.view.take() {
-            Some(view) if view.is_of(camera) => view,
-            _ => View::new(camera, &canonical, input.width, input.height),
+            Some(view) if view.is_of(camera, Texels::PLAIN) => view,
+            _ => View::new(camera, Texels::PLAIN, &canonical, input.width, input.height),
         };
         self.view = Some(view);
         Ok(view)
     }
-
-    /// What a frame of the networks says about the image as given.
-    fn estimate(&self, frame: Frame, view: &View, output: Output) -> Estimate {
-        let description = &self.description;
-        let (width, height) = (description.input.width, description.input.height);
-        let share = |pixels: u32| f64::from(pixels) / f64::from(width * height);
-        let bbox_px = frame.coverage.bbox.and_then(|bbox| view.bbox(bbox));
-
-        let (status, joints) = if frame.coverage.not_finite > 0 {
-            (Status::Invalid, Vec::new())
-        } else if share(frame.coverage.sure) < f64::from(description.presence.min_sure) {
-            (Status::NotFound, Vec::new())
-        } else if output.mask_only {
-            (Status::Found, Vec::new())
-        } else {
-            match joints(&frame.joints, &description.joints, &view.lens) {
-                Some(joints) => (Status::Found, joints),
-                None => (Status::Invalid, Vec::new()),
-            }
-        };
-        Estimate {
-            status,
-            coverage: view.share_of_image(share(frame.coverage.pixels)),
-            bbox_px,
-            field: view.field,
-            joints,
-            mask: output.mask.then_some(Mask {
-                width,
-                height,
-                probability: frame.mask,
-            }),
-        }
-    }
-}
-
-/// The joints in the camera's image; `None` unless all are finite, in front of the camera and where
-/// its lens can show them.
-fn joints(values: &[f32], names: &[String], lens: &Lens) -> Option<Vec<Joint>> {
-    values
-        .chunks_exact(3)
-        .zip(names)
-        .map(|(xyz, name)| {
-            let xyz_m = [xyz[0], xyz[1], xyz[2]].map(f64::from);
-            Some(Joint {
-                name: name.clone(),
-                xyz_m,
-                px: lens.project(xyz_m)?,
-            })
-        })
-        .collect()
 }
 
 fn run_reference(

@@ -1,4 +1,4 @@
-use crate::camera::{Camera, Distortion, Intrinsics, Lens, Rectification};
+use crate::camera::{Camera, Distortion, Intrinsics, Lens, Rectification, Texels};
 
 /// What the networks see of a camera's image.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -16,8 +16,15 @@ pub(super) struct View {
 }
 
 impl View {
-    /// From `camera` to the pinhole `canonical` with images of `width` x `height`.
-    pub fn new(camera: &Camera, canonical: &Intrinsics, width: u32, height: u32) -> Self {
+    /// From `camera`, whose pixels lie at `texels`, to the pinhole `canonical` with images of
+    /// `width` x `height`.
+    pub fn new(
+        camera: &Camera,
+        texels: Texels,
+        canonical: &Intrinsics,
+        width: u32,
+        height: u32,
+    ) -> Self {
         let pinhole = Camera {
             width,
             height,
@@ -28,15 +35,18 @@ impl View {
             camera: *camera,
             lens: camera.lens(),
             canonical: *canonical,
-            rectification: Rectification::new(camera, canonical, width, height),
+            rectification: Rectification {
+                texels,
+                ..Rectification::new(camera, canonical, width, height)
+            },
             field: camera.field_of(&pinhole),
             filled: pinhole.field_of(camera),
         }
     }
 
-    /// Whether this is the view of `camera`.
-    pub fn is_of(&self, camera: &Camera) -> bool {
-        self.camera == *camera
+    /// Whether this is the view of `camera`, whose pixels lie at `texels`.
+    pub fn is_of(&self, camera: &Camera, texels: Texels) -> bool {
+        self.camera == *camera && self.rectification.texels == texels
     }
 
     /// Where the camera sees what the canonical camera sees at `pixel`; `None` where its lens shows

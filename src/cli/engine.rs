@@ -40,11 +40,14 @@ impl EngineArgs {
         }
         let request = AdapterRequest::new(self.adapter.as_deref(), self.backend.as_deref());
         match Device::open(&request) {
-            Ok(device) if self.no_tuning => Ok(Some(Arc::new(device))),
             Ok(device) => {
-                let memory = tuning_file(&device).and_then(|file| fs::read(file).ok());
-                let device = device.tuned(Device::TUNING, &memory.unwrap_or_default());
-                Ok(Some(Arc::new(device)))
+                let pipelines = remembered(&device, PIPELINES);
+                let device = device.with_pipeline_cache(&pipelines);
+                if self.no_tuning {
+                    return Ok(Some(Arc::new(device)));
+                }
+                let tuning = remembered(&device, TUNING);
+                Ok(Some(Arc::new(device.tuned(Device::TUNING, &tuning))))
             }
             Err(error @ GpuError::NoAdapter { .. }) if request == AdapterRequest::default() => {
                 log::warn!("{error}: running on the CPU, which is slower");
@@ -73,16 +76,41 @@ pub(super) fn locator(
     Ok(locator)
 }
 
-/// Keeps what was found about an adapter, if there is anything new.
+/// Keeps what was found about an adapter and what its driver compiled, if there is anything new.
 pub(super) fn remember(device: &Device) {
-    let Some((file, tuning)) = tuning_file(device).zip(device.tuning()) else {
+    if let Some(tuning) = device.tuning() {
+        keep(device, TUNING, &tuning);
+    }
+    if let Some(pipelines) = device.pipeline_cache()
+        && pipelines != remembered(device, PIPELINES)
+    {
+        keep(device, PIPELINES, &pipelines);
+    }
+}
+
+/// Begins the name of the file, and ends it.
+type FileName = (&'static str, &'static str);
+
+/// Of the fastest kernels.
+const TUNING: FileName = ("tuning", "json");
+/// Of what the driver compiled.
+const PIPELINES: FileName = ("pipelines", "bin");
+
+/// Empty where there is nothing yet, or users have no folder for caches.
+fn remembered(device: &Device, name: FileName) -> Vec<u8> {
+    let bytes = cache_file(device, name).and_then(|file| fs::read(file).ok());
+    bytes.unwrap_or_default()
+}
+
+fn keep(device: &Device, name: FileName, bytes: &[u8]) {
+    let Some(file) = cache_file(device, name) else {
         return;
     };
     let write = || -> io::Result<()> {
         fs::create_dir_all(file.parent().unwrap_or(&file))?;
         // Another process may be reading it.
         let new = file.with_extension(format!("{}.new", std::process::id()));
-        fs::write(&new, &tuning)?;
+        fs::write(&new, bytes)?;
         fs::rename(&new, &file)
     };
     if let Err(error) = write() {
@@ -90,12 +118,12 @@ pub(super) fn remember(device: &Device) {
     }
 }
 
-/// Where what was found about an adapter is kept; `None` where users have no folder for caches.
-fn tuning_file(device: &Device) -> Option<PathBuf> {
+/// Where what is known of an adapter is kept; `None` where users have no folder for caches.
+fn cache_file(device: &Device, (begin, end): FileName) -> Option<PathBuf> {
     let adapter = device.info().name.to_lowercase();
     let adapter = adapter.replace(|c: char| !c.is_ascii_alphanumeric(), "-");
     let folder = dirs::cache_dir()?.join("whereabot");
-    Some(folder.join(format!("tuning-{adapter}.json")))
+    Some(folder.join(format!("{begin}-{adapter}.{end}")))
 }
 
 /// What to compute in.

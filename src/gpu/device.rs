@@ -1,4 +1,3 @@
-use std::collections::HashMap;
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -6,6 +5,7 @@ use std::time::Duration;
 use super::adapter::{self, AdapterRequest, Choice};
 use super::loss::Loss;
 use super::mapping::Mapping;
+use super::pipelines::Pipelines;
 #[cfg(not(target_arch = "wasm32"))]
 use super::tuner::Tuner;
 use super::{GpuError, Layout, Precision, Tier};
@@ -27,11 +27,8 @@ pub struct Device {
     fault: Arc<Mutex<Option<GpuError>>>,
     /// For a host's device.
     loss: Option<Loss>,
-    pipelines: Mutex<HashMap<PipelineKey, wgpu::ComputePipeline>>,
+    pipelines: Pipelines,
 }
-
-/// A kernel's text, its entry point, and the bits of its constants.
-type PipelineKey = (String, String, Vec<(String, u64)>);
 
 impl fmt::Debug for Device {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -54,6 +51,7 @@ impl Device {
     /// What is asked for where the adapter has it.
     const FEATURES: wgpu::Features = wgpu::Features::SUBGROUP
         .union(wgpu::Features::TIMESTAMP_QUERY)
+        .union(wgpu::Features::PIPELINE_CACHE)
         .union(wgpu::Features::SHADER_F16);
 
     /// Opens the adapter that `request` leads to.
@@ -114,6 +112,7 @@ impl Device {
         device.set_device_lost_callback(move |reason, message| {
             lost(GpuError::Lost(format!("{reason:?}: {message}")));
         });
+        let pipelines = Pipelines::new(&device, &[]);
         Ok(Self {
             tier,
             halves: adapter
@@ -128,7 +127,7 @@ impl Device {
             choice: Some(choice),
             fault,
             loss: None,
-            pipelines: Mutex::default(),
+            pipelines,
         })
     }
 
@@ -148,7 +147,7 @@ impl Device {
             choice: None,
             fault: Arc::default(),
             loss: Some(Loss::new(&device)),
-            pipelines: Mutex::default(),
+            pipelines: Pipelines::new(&device, &[]),
             device,
             queue,
         };
@@ -221,14 +220,28 @@ impl Device {
         self.tuner.memory(&self.info)
     }
 
+    /// Lets the driver take compiled kernels from `memory`, what [`Device::pipeline_cache`] gave in an earlier
+    /// process; what is of another adapter, driver or version, damaged, or no such thing at all, is passed
+    /// over. Without effect where the backend has no such cache, or a host did not enable
+    /// `PIPELINE_CACHE`.
+    #[must_use]
+    pub fn with_pipeline_cache(mut self, memory: &[u8]) -> Self {
+        self.pipelines = Pipelines::new(&self.device, memory);
+        self
+    }
+
+    /// What the driver compiled, to be remembered for [`Device::with_pipeline_cache`]; `None` where the
+    /// backend has no such cache.
+    pub fn pipeline_cache(&self) -> Option<Vec<u8>> {
+        self.pipelines.memory()
+    }
+
     #[cfg(not(target_arch = "wasm32"))]
     pub(super) fn tuner(&self) -> &Tuner {
         &self.tuner
     }
 
-    /// The pipeline of a kernel, made once for each text and set of constants: compiling is dear, and
-    /// many layers differ by what they bind only. Driver errors reach the caller's
-    /// [`Device::scoped`].
+    /// The pipeline of a kernel. Driver errors reach the caller's [`Device::scoped`].
     pub(super) fn pipeline(
         &self,
         label: &str,
@@ -236,39 +249,8 @@ impl Device {
         entry_point: &str,
         constants: &[(&str, f64)],
     ) -> wgpu::ComputePipeline {
-        let bits = constants
-            .iter()
-            .map(|(name, value)| ((*name).to_owned(), value.to_bits()))
-            .collect();
-        let key = (text, entry_point.to_owned(), bits);
-        let mut pipelines = self
-            .pipelines
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
-        if let Some(pipeline) = pipelines.get(&key) {
-            return pipeline.clone();
-        }
-        let module = self
-            .device
-            .create_shader_module(wgpu::ShaderModuleDescriptor {
-                label: Some(label),
-                source: wgpu::ShaderSource::Wgsl(key.0.as_str().into()),
-            });
-        let pipeline = self
-            .device
-            .create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-                label: Some(label),
-                layout: None,
-                module: &module,
-                entry_point: Some(entry_point),
-                compilation_options: wgpu::PipelineCompilationOptions {
-                    constants,
-                    ..Default::default()
-                },
-                cache: None,
-            });
-        pipelines.insert(key, pipeline.clone());
-        pipeline
+        self.pipelines
+            .get(&self.device, label, text, entry_point, constants)
     }
 
     /// Gives the first fault that happened since the device was opened.
@@ -396,7 +378,7 @@ impl Device {
 }
 
 /// Gives the bytes of a mapped `buffer` to `read`, and unmaps it.
-pub(super) fn mapped<T>(
+pub(crate) fn mapped<T>(
     buffer: &wgpu::Buffer,
     read: impl FnOnce(&[u8]) -> T,
 ) -> Result<T, GpuError> {

@@ -81,6 +81,16 @@ pub enum GpuError {
         /// What was given.
         found: usize,
     },
+    /// A host's texture that cannot be read.
+    #[error("{what}: expected {expected}, found {found}")]
+    Source {
+        /// Which texture, and what about it.
+        what: &'static str,
+        /// What can be read.
+        expected: String,
+        /// What was given.
+        found: String,
+    },
     /// The adapter has too little memory.
     #[error("out of GPU memory: {0}")]
     OutOfMemory(String),

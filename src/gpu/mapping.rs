@@ -1,10 +1,29 @@
+use std::pin::Pin;
+use std::task::{Context, Poll};
+
 use futures_channel::oneshot;
 
 use super::{Device, GpuError};
 
 /// A buffer on its way to the CPU.
 #[derive(Debug)]
-pub(crate) struct Mapping(oneshot::Receiver<Result<(), wgpu::BufferAsyncError>>);
+pub(crate) struct Mapping {
+    receiver: oneshot::Receiver<Result<(), wgpu::BufferAsyncError>>,
+    arrived: Option<Mapped>,
+}
+
+/// How far a [`Mapping`] is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Mapped {
+    /// On its way, or not submitted yet.
+    Pending,
+    /// It can be read, and is to be unmapped then.
+    Ready,
+    /// What was to fill it was dropped before it was submitted.
+    Never,
+    /// The device will not fill it.
+    Failed,
+}
 
 impl Mapping {
     /// With what is to be told when the buffer is mapped, or never will be.
@@ -17,49 +36,75 @@ impl Mapping {
             // Whoever waited may be gone.
             let _ = sender.send(result);
         };
-        (Self(receiver), callback)
+        let mapping = Self {
+            receiver,
+            arrived: None,
+        };
+        (mapping, callback)
     }
 
-    /// Whether the buffer is mapped by now.
-    ///
-    /// # Errors
-    /// [`GpuError::Lost`] where it never will be.
-    pub fn poll(&mut self) -> Result<bool, GpuError> {
-        match self.0.try_recv() {
-            Ok(None) => Ok(false),
-            Ok(Some(Ok(()))) => Ok(true),
-            Ok(Some(Err(error))) => Err(GpuError::Lost(error.to_string())),
-            Err(oneshot::Canceled) => Err(never()),
+    /// How far it is.
+    pub fn state(&mut self) -> Mapped {
+        if let Some(arrived) = self.arrived {
+            return arrived;
         }
+        let state = match self.receiver.try_recv() {
+            Ok(None) => return Mapped::Pending,
+            Ok(Some(result)) => of(Ok(result)),
+            Err(canceled) => of(Err(canceled)),
+        };
+        self.arrived = Some(state);
+        state
+    }
+
+    /// Ready once it is no longer pending.
+    pub fn poll_arrival(&mut self, context: &mut Context<'_>) -> Poll<Mapped> {
+        if let Some(arrived) = self.arrived {
+            return Poll::Ready(arrived);
+        }
+        let state = Pin::new(&mut self.receiver).poll(context).map(of);
+        if let Poll::Ready(arrived) = state {
+            self.arrived = Some(arrived);
+        }
+        state
     }
 
     /// Waits for it. Where threads share a device, what `device` waited for may be told by another one.
     ///
     /// # Errors
-    /// As [`Self::poll`]; not in a browser, [`GpuError::Timeout`] after [`Device::TIMEOUT`].
-    #[cfg(not(target_arch = "wasm32"))]
+    /// [`GpuError::Lost`] where it will never be mapped; not in a browser, [`GpuError::Timeout`] after
+    /// [`Device::TIMEOUT`].
     pub async fn finish(mut self, device: &Device) -> Result<(), GpuError> {
-        let start = std::time::Instant::now();
-        while !self.poll()? {
-            device.check()?;
-            if start.elapsed() > Device::TIMEOUT {
-                return Err(GpuError::Timeout(Device::TIMEOUT));
+        #[cfg(not(target_arch = "wasm32"))]
+        let arrived = {
+            let start = std::time::Instant::now();
+            loop {
+                match self.state() {
+                    Mapped::Pending if start.elapsed() > Device::TIMEOUT => {
+                        return Err(GpuError::Timeout(Device::TIMEOUT));
+                    }
+                    Mapped::Pending => {
+                        device.check()?;
+                        std::thread::sleep(std::time::Duration::from_micros(50));
+                    }
+                    arrived => break arrived,
+                }
             }
-            std::thread::sleep(std::time::Duration::from_micros(50));
+        };
+        #[cfg(target_arch = "wasm32")]
+        let arrived = std::future::poll_fn(|context| self.poll_arrival(context)).await;
+        if arrived == Mapped::Ready {
+            return Ok(());
         }
-        Ok(())
-    }
-
-    #[cfg(target_arch = "wasm32")]
-    pub async fn finish(self, _device: &Device) -> Result<(), GpuError> {
-        match self.0.await {
-            Ok(Ok(())) => Ok(()),
-            Ok(Err(error)) => Err(GpuError::Lost(error.to_string())),
-            Err(oneshot::Canceled) => Err(never()),
-        }
+        device.check()?;
+        Err(GpuError::Lost("a buffer was not mapped".into()))
     }
 }
 
-fn never() -> GpuError {
-    GpuError::Lost("a buffer was given up before it was mapped".into())
+fn of(result: Result<Result<(), wgpu::BufferAsyncError>, oneshot::Canceled>) -> Mapped {
+    match result {
+        Ok(Ok(())) => Mapped::Ready,
+        Ok(Err(_)) => Mapped::Failed,
+        Err(oneshot::Canceled) => Mapped::Never,
+    }
 }

@@ -64,6 +64,18 @@ impl NetworkPlan {
         input: &Tensor,
         kernel: Option<Conv2dKernel>,
     ) -> Result<Self, GpuError> {
+        Self::planned(device, name, network, input, kernel, &mut || {})
+    }
+
+    /// As [`NetworkPlan::with_kernel`], telling `planned` of each layer.
+    pub(super) fn planned(
+        device: &Device,
+        name: &str,
+        network: &Network,
+        input: &Tensor,
+        kernel: Option<Conv2dKernel>,
+        planned: &mut dyn FnMut(),
+    ) -> Result<Self, GpuError> {
         let size = |what, expected, found| {
             Err(GpuError::Size {
                 what,
@@ -171,6 +183,7 @@ impl NetworkPlan {
                     }
                 }
                 outputs.push(output);
+                planned();
             }
             let output = outputs.pop().ok_or(NetworkError::Empty)?;
             Ok(Self {

@@ -3,6 +3,7 @@ use image::RgbaImage;
 use super::coverage::{Totals, coverage};
 use super::overlay::overlay;
 use super::rectify::Rectify;
+use super::source::Planes;
 use super::step::Step;
 use super::tensor::{Tensor, staging_buffer, storage_buffer};
 use super::{Device, GpuError, NetworkPlan, Precision};
@@ -47,17 +48,47 @@ impl Plan {
         batch: usize,
         precision: Precision,
     ) -> Result<Self, GpuError> {
+        Self::with_progress(device, model, batch, precision, &mut |_, _| {})
+    }
+
+    /// As [`Plan::new`], telling `progress` how many layers of how many are planned.
+    pub(crate) fn with_progress(
+        device: &Device,
+        model: &Model,
+        batch: usize,
+        precision: Precision,
+        progress: &mut dyn FnMut(usize, usize),
+    ) -> Result<Self, GpuError> {
+        let networks = [&model.mask_network, &model.joint_network];
+        let layers = networks.iter().map(|network| network.nodes().len()).sum();
+        let mut done = 0;
+        let mut planned = || {
+            done += 1;
+            progress(done, layers);
+        };
         let description = &model.description;
         let layout = device.layout(precision)?;
         device.scoped(|| {
             let image = NetworkPlan::input(device, layout, "image", &model.mask_network, batch)?;
-            let rectify = (0..batch)
-                .map(|_| Rectify::new(device, &image))
-                .collect::<Result<_, _>>()?;
-            let mask = NetworkPlan::new(device, "mask", &model.mask_network, &image)?;
+            let rectify = (0..batch).map(|_| Rectify::new(device)).collect();
+            let mask = NetworkPlan::planned(
+                device,
+                "mask",
+                &model.mask_network,
+                &image,
+                None,
+                &mut planned,
+            )?;
             let masked =
                 NetworkPlan::input(device, layout, "overlay", &model.joint_network, batch)?;
-            let joint = NetworkPlan::new(device, "joint", &model.joint_network, &masked)?;
+            let joint = NetworkPlan::planned(
+                device,
+                "joint",
+                &model.joint_network,
+                &masked,
+                None,
+                &mut planned,
+            )?;
             let totals = storage_buffer(
                 device,
                 "coverage: totals",
@@ -95,17 +126,39 @@ impl Plan {
         source: &RgbaImage,
         rectification: &Rectification,
     ) -> Result<(), GpuError> {
-        let batch = self.rectify.len();
-        let slot = self.rectify.get_mut(index).ok_or(GpuError::Size {
-            what: "batch index",
-            expected: batch,
-            found: index,
-        })?;
-        let params = Rectification {
-            index: index as u32,
-            ..*rectification
-        };
+        let (slot, params) = slot(&mut self.rectify, index, rectification)?;
         slot.write(device, &self.image, source, &params)
+    }
+
+    /// Gives image `index` of the frames from the next one on: `planes`, and how they become the canonical
+    /// image.
+    ///
+    /// # Errors
+    /// An `index` beyond the batch, planes that cannot be read.
+    pub fn bind(
+        &mut self,
+        device: &Device,
+        index: usize,
+        planes: &Planes,
+        rectification: &Rectification,
+    ) -> Result<(), GpuError> {
+        let (slot, params) = slot(&mut self.rectify, index, rectification)?;
+        slot.bind(device, &self.image, planes, &params)
+    }
+
+    /// The mask network's output: probabilities `[1, height, width]`.
+    pub(super) fn mask(&self) -> &Tensor {
+        self.mask.output()
+    }
+
+    /// The joint network's output: `[3 joints, 1, 1]`.
+    pub(super) fn joints(&self) -> &Tensor {
+        self.joint.output()
+    }
+
+    /// What there is to see in the masks: one [`Totals`] an image.
+    pub(super) fn totals(&self) -> &wgpu::Buffer {
+        &self.totals
     }
 
     /// The dispatches of a frame, in order; those of the joint network only `with_joints`.
@@ -113,7 +166,7 @@ impl Plan {
         let joints = [&self.overlay].into_iter().chain(self.joint.steps());
         self.rectify
             .iter()
-            .map(Rectify::step)
+            .filter_map(Rectify::step)
             .chain(self.mask.steps())
             .chain([&self.coverage])
             .chain(joints.take(if with_joints { usize::MAX } else { 0 }))
@@ -158,24 +211,58 @@ impl Plan {
         with_mask: bool,
         timestamps: Option<wgpu::ComputePassTimestampWrites<'_>>,
     ) {
+        self.dispatch(encoder, self.steps(with_joints), timestamps);
+        self.copy_results(encoder, &self.results);
+        if with_mask {
+            self.mask.output().copy_to(encoder, &self.masks, 0);
+        }
+    }
+
+    /// Records `steps`, those of a frame and perhaps some behind them, in one compute pass.
+    pub(crate) fn dispatch<'a>(
+        &self,
+        encoder: &mut wgpu::CommandEncoder,
+        steps: impl Iterator<Item = &'a Step>,
+        timestamps: Option<wgpu::ComputePassTimestampWrites<'_>>,
+    ) {
         encoder.clear_buffer(&self.totals, 0, None);
         let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
             label: None,
             timestamp_writes: timestamps,
         });
-        for step in self.steps(with_joints) {
+        for step in steps {
             step.encode(&mut pass);
         }
-        drop(pass);
+    }
+
+    /// A buffer for [`Self::copy_results`], to be mapped.
+    pub(crate) fn results_buffer(&self, device: &Device) -> wgpu::Buffer {
+        let joints = self.joint.output().staging_size();
+        staging_buffer(device, joints + self.totals.size())
+    }
+
+    /// Records the copy of a frame's results, for [`Self::frames_in`].
+    pub(crate) fn copy_results(&self, encoder: &mut wgpu::CommandEncoder, results: &wgpu::Buffer) {
         let joints = self.joint.output();
         let (after_joints, totals) = (joints.staging_size(), self.totals.size());
-        if with_joints {
-            joints.copy_to(encoder, &self.results, 0);
-        }
-        encoder.copy_buffer_to_buffer(&self.totals, 0, &self.results, after_joints, totals);
-        if with_mask {
-            self.mask.output().copy_to(encoder, &self.masks, 0);
-        }
+        joints.copy_to(encoder, results, 0);
+        encoder.copy_buffer_to_buffer(&self.totals, 0, results, after_joints, totals);
+    }
+
+    /// What [`Self::copy_results`] copied: each image's, without masks.
+    pub(crate) fn frames_in(&self, bytes: &[u8]) -> Vec<Frame> {
+        let shape = self.image.shape;
+        let (width, height) = (shape.width as u32, shape.height as u32);
+        let (joints, totals) = bytes.split_at(self.joint.output().staging_size() as usize);
+        totals
+            .chunks_exact(size_of::<Totals>())
+            .zip(self.joints_in(joints))
+            .map(|(totals, joints)| Frame {
+                coverage: bytemuck::pod_read_unaligned::<Totals>(totals).coverage(width, height),
+                joints,
+                mask: Vec::new(),
+            })
+            .collect()
     }
 
     /// Waits for a frame that was submitted as [`Plan::encode`] recorded it: the result of each image.
@@ -189,28 +276,15 @@ impl Plan {
         with_joints: bool,
         with_mask: bool,
     ) -> Result<Vec<Frame>, GpuError> {
-        let after_joints = self.joint.output().staging_size();
-        let shape = self.image.shape;
-        let (width, height) = (shape.width as u32, shape.height as u32);
-        let frames = device.read_async(&self.results, |bytes| {
-            let (joints, totals) = bytes.split_at(after_joints as usize);
-            let joints = self.joints_in(joints);
-            totals
-                .chunks_exact(size_of::<Totals>())
-                .zip(joints)
-                .map(|(totals, joints)| Frame {
-                    coverage: bytemuck::pod_read_unaligned::<Totals>(totals)
-                        .coverage(width, height),
-                    joints: if with_joints { joints } else { Vec::new() },
-                    mask: Vec::new(),
-                })
-                .collect::<Vec<_>>()
-        });
+        let frames = device.read_async(&self.results, |bytes| self.frames_in(bytes));
         let mut frames = frames.await?;
+        if !with_joints {
+            frames.iter_mut().for_each(|frame| frame.joints.clear());
+        }
         if with_mask {
             let values = device.read_async(&self.masks, |bytes| self.mask.output().values(bytes));
             let values = values.await?;
-            let plane = shape.height * shape.width;
+            let plane = self.image.shape.height * self.image.shape.width;
             for (frame, mask) in frames.iter_mut().zip(values.chunks_exact(plane)) {
                 frame.mask = mask.to_vec();
             }
@@ -232,8 +306,8 @@ impl Plan {
         self.mask.output().write(device, masks)?;
         let mut encoder = device.wgpu().create_command_encoder(&Default::default());
         let mut pass = encoder.begin_compute_pass(&Default::default());
-        for rectify in &self.rectify {
-            rectify.step().encode(&mut pass);
+        for step in self.rectify.iter().filter_map(Rectify::step) {
+            step.encode(&mut pass);
         }
         self.overlay.encode(&mut pass);
         self.joint.encode(&mut pass);
@@ -253,4 +327,23 @@ impl Plan {
             .map(<[f32]>::to_vec)
             .collect()
     }
+}
+
+/// Where image `index` of a batch is rectified, and how.
+fn slot<'a>(
+    slots: &'a mut [Rectify],
+    index: usize,
+    rectification: &Rectification,
+) -> Result<(&'a mut Rectify, Rectification), GpuError> {
+    let batch = slots.len();
+    let slot = slots.get_mut(index).ok_or(GpuError::Size {
+        what: "batch index",
+        expected: batch,
+        found: index,
+    })?;
+    let params = Rectification {
+        index: index as u32,
+        ..*rectification
+    };
+    Ok((slot, params))
 }

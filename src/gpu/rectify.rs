@@ -1,57 +1,53 @@
 use image::RgbaImage;
 
+use super::source::{Planes, SourceKind};
 use super::step::{Step, StepDescriptor, Tensors, Work};
 use super::tensor::Tensor;
 use super::{Device, GpuError};
 use crate::camera::Rectification;
 
-/// A source image, and its way into one image of a batch (`shaders/rectify.wgsl`). The texture is
-/// made anew only when the source's size changes.
+/// A source image, and its way into one image of a batch (`shaders/rectify.wgsl`): a texture of our own,
+/// made anew only when the size of what is written changes, or a host's.
 #[derive(Debug)]
 pub struct Rectify {
-    texture: wgpu::Texture,
     params: wgpu::Buffer,
+    /// What `params` holds from the next submission on.
+    written: Option<Rectification>,
+    bound: Option<Bound>,
+}
+
+/// A source that is bound.
+#[derive(Debug)]
+struct Bound {
+    source: Source,
+    kind: SourceKind,
     step: Step,
 }
 
+#[derive(Debug, PartialEq)]
+enum Source {
+    Own(wgpu::Texture),
+    Host(Planes),
+}
+
 impl Rectify {
-    /// Into `output` `[3, height, width]`.
-    ///
-    /// # Errors
-    /// More pixels than a dispatch holds. Driver errors reach the caller's [`Device::scoped`].
-    pub fn new(device: &Device, output: &Tensor) -> Result<Self, GpuError> {
-        let (height, width) = (output.shape.height, output.shape.width);
-        let texture = texture(device, 1, 1)?;
+    /// Without a source. Driver errors reach the caller's [`Device::scoped`].
+    pub fn new(device: &Device) -> Self {
         let params = device.wgpu().create_buffer(&wgpu::BufferDescriptor {
             label: Some("rectify: params"),
             size: size_of::<Rectification>() as u64,
             usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
         });
-        let view = texture.create_view(&Default::default());
-        let step = Step::new(
-            device,
-            &StepDescriptor {
-                label: "rectify",
-                kernel: "rectify",
-                source: include_str!("../../shaders/rectify.wgsl"),
-                entry_point: "main",
-                tensors: Tensors::to(output),
-                constants: &[],
-                sizes: &[],
-                bindings: &bindings(&view, &params),
-                workgroups: (height * width).div_ceil(64),
-                work: work(&texture, output),
-            },
-        )?;
-        Ok(Self {
-            texture,
+        Self {
             params,
-            step,
-        })
+            written: None,
+            bound: None,
+        }
     }
 
-    /// Writes `image` and `params` at the queue's next submission. `output` is that of [`Self::new`].
+    /// Writes `image` and `params` at the queue's next submission. To be rectified into `output`
+    /// `[3, height, width]`, always the same.
     ///
     /// # Errors
     /// An image beyond the adapter's limits, or too little memory.
@@ -63,55 +59,129 @@ impl Rectify {
         params: &Rectification,
     ) -> Result<(), GpuError> {
         let (width, height) = image.dimensions();
-        if (width, height) != (self.texture.width(), self.texture.height()) {
-            self.texture = device.scoped(|| texture(device, width, height))?;
-            let view = self.texture.create_view(&Default::default());
-            self.step.rebind(
-                device,
-                Tensors::to(output),
-                &bindings(&view, &self.params),
-                work(&self.texture, output),
-            );
-        }
+        let own = match &self.bound {
+            Some(Bound {
+                source: Source::Own(texture),
+                ..
+            }) if (texture.width(), texture.height()) == (width, height) => texture.clone(),
+            _ => {
+                let texture = device.scoped(|| texture(device, width, height))?;
+                self.bind_source(
+                    device,
+                    output,
+                    Source::Own(texture.clone()),
+                    SourceKind::Storage,
+                )?;
+                texture
+            }
+        };
         device.queue().write_texture(
-            self.texture.as_image_copy(),
+            own.as_image_copy(),
             image,
             wgpu::TexelCopyBufferLayout {
                 offset: 0,
                 bytes_per_row: Some(4 * width),
                 rows_per_image: None,
             },
-            self.texture.size(),
+            own.size(),
         );
-        device
-            .queue()
-            .write_buffer(&self.params, 0, bytemuck::bytes_of(params));
+        self.write_params(device, params);
         Ok(())
     }
 
-    /// The dispatch.
-    pub fn step(&self) -> &Step {
-        &self.step
+    /// Reads a host's `planes` from now on, and takes `params` from the queue's next submission on. To be
+    /// rectified into `output` `[3, height, width]`, always the same. Makes nothing where the planes are
+    /// those of the last time.
+    ///
+    /// # Errors
+    /// Planes that cannot be read: nothing is changed then.
+    pub fn bind(
+        &mut self,
+        device: &Device,
+        output: &Tensor,
+        planes: &Planes,
+        params: &Rectification,
+    ) -> Result<(), GpuError> {
+        let is_bound =
+            |bound: &Bound| matches!(&bound.source, Source::Host(host) if host == planes);
+        if !self.bound.as_ref().is_some_and(is_bound) {
+            let kind = planes.kind(device)?;
+            self.bind_source(device, output, Source::Host(planes.clone()), kind)?;
+        }
+        self.write_params(device, params);
+        Ok(())
     }
-}
 
-/// Reads the source once, writes one image of `output`.
-fn work(source: &wgpu::Texture, output: &Tensor) -> Work {
-    Work {
-        operations: 0,
-        bytes: 4 * u64::from(source.width()) * u64::from(source.height())
-            + 4 * output.shape.len() as u64,
+    /// The dispatch; `None` without a source.
+    pub fn step(&self) -> Option<&Step> {
+        self.bound.as_ref().map(|bound| &bound.step)
     }
-}
 
-fn bindings<'a>(
-    view: &'a wgpu::TextureView,
-    params: &'a wgpu::Buffer,
-) -> [(u32, wgpu::BindingResource<'a>); 2] {
-    [
-        (3, wgpu::BindingResource::TextureView(view)),
-        (4, params.as_entire_binding()),
-    ]
+    fn write_params(&mut self, device: &Device, params: &Rectification) {
+        if self.written.as_ref() != Some(params) {
+            let bytes = bytemuck::bytes_of(params);
+            device.queue().write_buffer(&self.params, 0, bytes);
+            self.written = Some(*params);
+        }
+    }
+
+    fn bind_source(
+        &mut self,
+        device: &Device,
+        output: &Tensor,
+        source: Source,
+        kind: SourceKind,
+    ) -> Result<(), GpuError> {
+        let own;
+        let mut bindings = vec![(4, self.params.as_entire_binding())];
+        let bytes = match &source {
+            Source::Own(texture) => {
+                own = texture.create_view(&Default::default());
+                bindings.push((3, wgpu::BindingResource::TextureView(&own)));
+                4 * u64::from(texture.width()) * u64::from(texture.height())
+            }
+            Source::Host(planes) => {
+                let (first, chroma) = match planes {
+                    Planes::Rgba(view) => (view, None),
+                    Planes::Nv12 { luma, chroma, .. } => (luma, Some(chroma)),
+                };
+                bindings.push((3, wgpu::BindingResource::TextureView(first)));
+                bindings.extend(chroma.map(|v| (5, wgpu::BindingResource::TextureView(v))));
+                planes.bytes()
+            }
+        };
+        let work = Work {
+            operations: 0,
+            bytes: bytes + 4 * output.shape.len() as u64,
+        };
+        let tensors = Tensors::to(output);
+        let constants = match kind {
+            SourceKind::Nv12(encoding) => encoding.constants().to_vec(),
+            _ => Vec::new(),
+        };
+        let step = device.scoped(|| match &self.bound {
+            Some(bound) if bound.kind == kind => {
+                Ok(bound.step.rebound(device, tensors, &bindings, work))
+            }
+            _ => Step::new(
+                device,
+                &StepDescriptor {
+                    label: "rectify",
+                    kernel: "rectify",
+                    source: kind.text(),
+                    entry_point: "main",
+                    tensors,
+                    constants: &constants,
+                    sizes: &[],
+                    bindings: &bindings,
+                    workgroups: (output.shape.height * output.shape.width).div_ceil(64),
+                    work,
+                },
+            ),
+        })?;
+        self.bound = Some(Bound { source, kind, step });
+        Ok(())
+    }
 }
 
 fn texture(device: &Device, width: u32, height: u32) -> Result<wgpu::Texture, GpuError> {

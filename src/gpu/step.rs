@@ -2,7 +2,7 @@ use super::tensor::Tensor;
 use super::{Device, GpuError, Layout, kernel_text};
 
 /// One dispatch of a kernel: all that encoding it needs, made once.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Step {
     label: String,
     kernel: &'static str,
@@ -204,16 +204,19 @@ impl Step {
         self.work
     }
 
-    /// Binds other resources to the same kernel.
-    pub(super) fn rebind(
-        &mut self,
+    /// The same kernel, bound to other resources. Driver errors reach the caller's [`Device::scoped`].
+    pub(super) fn rebound(
+        &self,
         device: &Device,
         tensors: Tensors<'_>,
         bindings: &[(u32, wgpu::BindingResource<'_>)],
         work: Work,
-    ) {
-        self.work = work;
-        self.bind_group = bind(device, &self.pipeline, tensors, bindings);
+    ) -> Self {
+        Self {
+            work,
+            bind_group: bind(device, &self.pipeline, tensors, bindings),
+            ..self.clone()
+        }
     }
 
     /// Records the dispatch.

@@ -78,6 +78,13 @@ pub struct Presence {
     pub min_sure: f32,
 }
 
+impl Presence {
+    /// The fewest sure pixels, of so many in the image, that mean a robot.
+    pub fn min_sure_pixels(&self, pixels: u32) -> u32 {
+        (f64::from(self.min_sure) * f64::from(pixels)).ceil() as u32
+    }
+}
+
 impl Description {
     /// The version of the description that this library reads.
     pub const VERSION: u32 = 1;

@@ -14,6 +14,7 @@ mod overlay;
 mod rectify;
 mod sigmoid;
 mod soft_argmax2d;
+mod unrectify;
 mod upsample2d;
 
 pub use back_project::back_project;
@@ -27,6 +28,7 @@ pub use overlay::overlay;
 pub use rectify::rectify;
 pub use sigmoid::sigmoid;
 pub use soft_argmax2d::soft_argmax2d;
+pub use unrectify::unrectify;
 pub use upsample2d::upsample2d;
 
 use crate::network::{Activation, Shape};

@@ -8,6 +8,8 @@ use crate::network::Shape;
 /// Undistorts and resamples `image` into the canonical pinhole camera: `[3, height, width]`, values
 /// in [0, 1], alpha ignored.
 ///
+/// `image` holds the source's pixels where [`Rectification::texels`] says.
+///
 /// A pixel is the mean of a grid of bilinear samples over its footprint in the source, as many as
 /// the footprint has pixels. What the source does not show is black. In f32 as the kernel.
 pub fn rectify(image: &RgbaImage, params: &Rectification, height: usize, width: usize) -> Tensor {
@@ -55,7 +57,7 @@ fn pixel(image: &RgbaImage, params: &Rectification, [x, y]: [f32; 2]) -> [f32; 3
                 (j as f32 + 0.5) * step[1] - 0.5,
             ];
             let at = [0, 1].map(|a| centre[a] + along_x[a] * part[0] + along_y[a] * part[1]);
-            for (total, value) in sum.iter_mut().zip(sample(image, at)) {
+            for (total, value) in sum.iter_mut().zip(sample(image, params, at)) {
                 *total += value;
             }
         }
@@ -100,20 +102,22 @@ fn project(params: &Rectification, ray: [f32; 2]) -> [f32; 2] {
 }
 
 /// Bilinear, as if black pixels lay round the source: without a step at its border.
-fn sample(image: &RgbaImage, [x, y]: [f32; 2]) -> [f32; 3] {
-    let (width, height) = image.dimensions();
-    if !(x > -1.0 && y > -1.0 && x < width as f32 && y < height as f32) {
+fn sample(image: &RgbaImage, params: &Rectification, [x, y]: [f32; 2]) -> [f32; 3] {
+    let [width, height] = params.size;
+    if !(x > -1.0 && y > -1.0 && x < width && y < height) {
         return [0.0; 3];
     }
-    let load = |x: i64, y: i64| {
-        let pixel = u32::try_from(x).ok().zip(u32::try_from(y).ok());
-        match pixel.and_then(|(x, y)| image.get_pixel_checked(x, y)) {
-            Some(Rgba([r, g, b, _])) => [*r, *g, *b].map(|v| f32::from(v) / 255.0),
-            None => [0.0; 3],
+    let load = |x: i32, y: i32| {
+        let inside = x >= 0 && y >= 0 && (x as f32) < width && (y as f32) < height;
+        let [column, row] = params.texels.at([x, y]);
+        let texel = u32::try_from(column).ok().zip(u32::try_from(row).ok());
+        match texel.and_then(|(column, row)| image.get_pixel_checked(column, row)) {
+            Some(Rgba([r, g, b, _])) if inside => [*r, *g, *b].map(|v| f32::from(v) / 255.0),
+            _ => [0.0; 3],
         }
     };
     let mix = |a: [f32; 3], b: [f32; 3], t: f32| [0, 1, 2].map(|i| a[i] * (1.0 - t) + b[i] * t);
-    let (column, row) = (x.floor() as i64, y.floor() as i64);
+    let (column, row) = (x.floor() as i32, y.floor() as i32);
     let (part_x, part_y) = (x - x.floor(), y - y.floor());
     let top = mix(load(column, row), load(column + 1, row), part_x);
     let bottom = mix(load(column, row + 1), load(column + 1, row + 1), part_x);

@@ -1,0 +1,93 @@
+use std::collections::HashMap;
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::sync::{Mutex, PoisonError};
+
+/// The pipelines of a device, made once for each text and set of constants: compiling is dear, and many
+/// layers differ by what they bind only.
+#[derive(Default)]
+pub(super) struct Pipelines {
+    made: Mutex<HashMap<Key, wgpu::ComputePipeline>>,
+    /// The driver's own, where the backend has one.
+    cache: Option<wgpu::PipelineCache>,
+}
+
+/// A kernel's text, its entry point, and the bits of its constants.
+type Key = (String, String, Vec<(String, u64)>);
+
+impl Pipelines {
+    /// With what [`Self::memory`] gave in an earlier process; what is foreign or damaged is passed over.
+    pub fn new(device: &wgpu::Device, memory: &[u8]) -> Self {
+        if !device.features().contains(wgpu::Features::PIPELINE_CACHE) {
+            return Self::default();
+        }
+        let data = memory
+            .split_first_chunk()
+            .and_then(|(sum, data)| (u64::from_le_bytes(*sum) == checksum(data)).then_some(data));
+        // SAFETY: the data is what wgpu gave: a checksum says that it is whole, and wgpu itself passes over
+        // what is of another adapter, driver or version.
+        #[allow(unsafe_code)]
+        let cache = unsafe {
+            device.create_pipeline_cache(&wgpu::PipelineCacheDescriptor {
+                label: Some("whereabot"),
+                data,
+                fallback: true,
+            })
+        };
+        Self {
+            made: Mutex::default(),
+            cache: Some(cache),
+        }
+    }
+
+    /// What to remember.
+    pub fn memory(&self) -> Option<Vec<u8>> {
+        let data = self.cache.as_ref()?.get_data()?;
+        let mut memory = checksum(&data).to_le_bytes().to_vec();
+        memory.extend(data);
+        Some(memory)
+    }
+
+    /// The pipeline of a kernel. Driver errors reach the error scope of the caller.
+    pub fn get(
+        &self,
+        device: &wgpu::Device,
+        label: &str,
+        text: String,
+        entry_point: &str,
+        constants: &[(&str, f64)],
+    ) -> wgpu::ComputePipeline {
+        let bits = constants
+            .iter()
+            .map(|(name, value)| ((*name).to_owned(), value.to_bits()))
+            .collect();
+        let key = (text, entry_point.to_owned(), bits);
+        let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(pipeline) = made.get(&key) {
+            return pipeline.clone();
+        }
+        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+            label: Some(label),
+            source: wgpu::ShaderSource::Wgsl(key.0.as_str().into()),
+        });
+        let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            label: Some(label),
+            layout: None,
+            module: &module,
+            entry_point: Some(entry_point),
+            compilation_options: wgpu::PipelineCompilationOptions {
+                constants,
+                ..Default::default()
+            },
+            cache: self.cache.as_ref(),
+        });
+        made.insert(key, pipeline.clone());
+        pipeline
+    }
+}
+
+/// Of what may have been damaged on a disk.
+fn checksum(data: &[u8]) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    data.hash(&mut hasher);
+    hasher.finish()
+}
