@@ -10,7 +10,7 @@ class OnGpu {
   static async open(canvas, adapter) {
     const engine = new OnGpu();
     engine.name = nameOf(adapter.info);
-    engine.gpu = await Gpu.open(canvas, engine.name);
+    engine.gpu = await Gpu.open(canvas, engine.name, navigator.gpu.getPreferredCanvasFormat());
     return engine;
   }
 

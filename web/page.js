@@ -298,6 +298,9 @@ for (const event of ['dragover', 'dragleave', 'drop']) {
   });
 }
 
+// A defect in the engine leaves nothing to wait for.
+addEventListener('error', ({ message }) => complain(message));
+
 attempt(async () => {
   const opened = await open($('picture'), new URLSearchParams(location.search).get('engine'));
   engine = opened.engine;

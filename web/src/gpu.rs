@@ -5,7 +5,7 @@ use web_sys::{HtmlCanvasElement, HtmlVideoElement, ImageBitmap};
 use whereabot::benchmark::{self, Options, Weights};
 use whereabot::camera::Camera;
 use whereabot::cascade::{HostLocator, HostOptions, MaskSize, Source};
-use whereabot::gpu::{AdapterRequest, Device, Planes};
+use whereabot::gpu::{AdapterRequest, Device};
 use whereabot::network::Model;
 
 use crate::screen::Screen;
@@ -32,11 +32,15 @@ struct Finder {
 #[wasm_bindgen]
 impl Gpu {
     /// Opens the adapter that the browser offers, to draw on `canvas`. `adapter` is its name, which a
-    /// browser does not tell wgpu.
-    pub async fn open(canvas: HtmlCanvasElement, adapter: String) -> Result<Self, JsError> {
+    /// browser does not tell wgpu, `format` the texture format that it prefers for canvases.
+    pub async fn open(
+        canvas: HtmlCanvasElement,
+        adapter: String,
+        format: String,
+    ) -> Result<Self, JsError> {
         let device = Device::open_async(&AdapterRequest::default()).await?;
         Ok(Self {
-            screen: Screen::new(device.wgpu(), canvas)?,
+            screen: Screen::new(device.wgpu(), canvas, &format)?,
             device: Arc::new(device),
             adapter,
             finder: None,
@@ -74,7 +78,7 @@ impl Gpu {
         let camera = Camera::from_hfov(width, height, hfov.to_radians());
         let finder = self.finder.as_mut().ok_or_else(not_loaded)?;
         let locator = &mut finder.locator;
-        locator.set_source(0, &Source::new(Planes::Rgba(view.clone()), camera))?;
+        locator.set_source(0, &Source::new(view.clone(), camera))?;
 
         let mut encoder = self
             .device

@@ -11,6 +11,14 @@ pub use cpu::Cpu;
 pub use gpu::Gpu;
 use wasm_bindgen::prelude::*;
 
+/// Panics are defects; their message is for who reports one.
+#[wasm_bindgen(start)]
+fn start() {
+    std::panic::set_hook(Box::new(|info| {
+        web_sys::console::error_1(&info.to_string().into());
+    }));
+}
+
 /// The horizontal field of view that is assumed for a picture of which nothing is known, in degrees.
 #[wasm_bindgen]
 pub fn assumed_hfov(width: u32, height: u32) -> f64 {

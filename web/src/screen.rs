@@ -10,14 +10,22 @@ pub const STRENGTH: f32 = 0.5;
 pub struct Screen {
     device: wgpu::Device,
     surface: wgpu::Surface<'static>,
+    format: wgpu::TextureFormat,
     size: [u32; 2],
     pipeline: wgpu::RenderPipeline,
 }
 
 impl Screen {
-    const FORMAT: wgpu::TextureFormat = wgpu::TextureFormat::Bgra8Unorm;
-
-    pub fn new(device: &wgpu::Device, canvas: HtmlCanvasElement) -> Result<Self, JsError> {
+    /// `format` is the one that the browser prefers: `bgra8unorm` or `rgba8unorm`.
+    pub fn new(
+        device: &wgpu::Device,
+        canvas: HtmlCanvasElement,
+        format: &str,
+    ) -> Result<Self, JsError> {
+        let format = match format {
+            "bgra8unorm" => wgpu::TextureFormat::Bgra8Unorm,
+            _ => wgpu::TextureFormat::Rgba8Unorm,
+        };
         let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
         let surface = instance.create_surface(wgpu::SurfaceTarget::Canvas(canvas))?;
         let module = device.create_shader_module(wgpu::include_wgsl!("tint.wgsl"));
@@ -47,7 +55,7 @@ impl Screen {
                     constants: &constants,
                     ..Default::default()
                 },
-                targets: &[Some(Self::FORMAT.into())],
+                targets: &[Some(format.into())],
             }),
             multiview_mask: None,
             cache: None,
@@ -55,6 +63,7 @@ impl Screen {
         Ok(Self {
             device: device.clone(),
             surface,
+            format,
             size: [0, 0],
             pipeline,
         })
@@ -75,7 +84,7 @@ impl Screen {
                 &self.device,
                 &wgpu::SurfaceConfiguration {
                     usage: wgpu::TextureUsages::RENDER_ATTACHMENT,
-                    format: Self::FORMAT,
+                    format: self.format,
                     color_space: Default::default(),
                     width: size[0],
                     height: size[1],

@@ -39,6 +39,12 @@ impl Page {
             ])
             .args(["--headless=new", "--no-sandbox", "--remote-debugging-pipe"])
             .args(["--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"])
+            // With these, videos go to textures and WebGPU to canvases; else the GPU process falls.
+            .args([
+                "--enable-features=Vulkan",
+                "--use-vulkan=swiftshader",
+                "--use-angle=swiftshader",
+            ])
             .args([
                 "--use-fake-device-for-media-stream",
                 "--use-fake-ui-for-media-stream",
@@ -150,12 +156,13 @@ impl Page {
     pub fn wait_until(&mut self, expression: &str) {
         let start = Instant::now();
         while self.run(&format!("return {expression}")) != true {
-            assert!(
-                start.elapsed() < Self::PATIENCE,
-                "still not so: {expression}; page: {:?}, says {}",
-                self.faults,
-                self.run("return document.body.innerText")
-            );
+            if start.elapsed() > Self::PATIENCE {
+                let text = self.run("return document.body.innerText");
+                panic!(
+                    "still not so: {expression}; page: {:?}, says {text}",
+                    self.faults
+                );
+            }
             std::thread::sleep(Duration::from_millis(50));
         }
     }
