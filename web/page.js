@@ -71,28 +71,31 @@ function nextFrame(video) {
 async function search(from) {
   const { picture, width, height } = from;
   if (picture.readyState < HTMLMediaElement.HAVE_CURRENT_DATA) return;
-  const slow = setTimeout(() => ($('busy').hidden = false), 300);
+  const slow = setTimeout(() => $('caption').classList.add('busy'), 300);
   if ($('picture').width !== width || $('picture').height !== height) {
     Object.assign($('picture'), { width, height });
   }
   const start = performance.now();
-  const answer = await engine.locate(picture, width, height, Number($('hfov').value));
-  clearTimeout(slow);
-  $('busy').hidden = true;
-  if (from === source) show(answer, performance.now() - start);
+  try {
+    const answer = await engine.locate(picture, width, height, Number($('hfov').value));
+    if (from === source) show(answer, performance.now() - start);
+  } finally {
+    clearTimeout(slow);
+    $('caption').classList.remove('busy');
+  }
 }
 
 // --- showing
 
 function show({ status, coverage, joints }, ms) {
-  $('hint').hidden = true;
   $('view').classList.toggle('mirrored', source.mirrored);
   const robot = document.querySelector('[name=robot]:checked').value.toUpperCase();
   const words = { found: `${robot} found`, not_found: 'No robot', invalid: 'No sensible answer' };
   $('status').textContent = words[status];
   $('status').className = status;
-  $('time').textContent = ms < 100 ? `${ms.toFixed(1)} ms` : ms < 1000 ? `${ms.toFixed(0)} ms` : `${(ms / 1000).toFixed(1)} s`;
+  $('time').textContent = ms < 1000 ? `${ms.toFixed(ms < 100 ? 1 : 0)} ms` : `${(ms / 1000).toFixed(1)} s`;
   $('rate').textContent = rate();
+  $('caption').textContent = `${words[status]} · ${$('time').textContent}`;
   $('coverage').textContent = `${(100 * coverage).toFixed(1)} %`;
   $('positions').hidden = joints.length === 0;
   $('positions').tBodies[0].replaceChildren(...joints.map(({ name, xyz_m }, index) => {
@@ -155,12 +158,15 @@ function tableRow(cells) {
 // Searches `next` from now on, whose camera sees `hfov` degrees across.
 function use(next, hfov = assumed_hfov(next.width, next.height)) {
   source?.stop?.();
-  source = next;
+  source = { live: false, mirrored: false, ...next };
   times.length = 0;
   setHfov(hfov);
-  document.querySelector('.live').hidden = !next.live;
-  $('flip').hidden = !next.camera;
+  document.querySelector('.live').hidden = !source.live;
+  $('flip').hidden = !source.camera;
   $('pause').textContent = 'Pause';
+  $('hint').hidden = true;
+  $('caption').textContent = 'looking for the robot';
+  $('caption').hidden = false;
   return refresh();
 }
 
@@ -247,7 +253,7 @@ async function measure() {
     });
     $('layers').tBodies[0].replaceChildren(...rows);
     $('layers').hidden = $('copy').hidden = false;
-    $('progress').textContent = `${all.frames_per_s} pictures a second: ${all.wall_ms_p50} ms each, there and back`;
+    $('progress').textContent = `${all.frames_per_s.toFixed(1)} pictures a second: ${all.wall_ms_p50.toFixed(1)} ms each, from memory to memory`;
   } catch (error) {
     $('progress').textContent = '';
     throw error;

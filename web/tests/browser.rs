@@ -16,6 +16,7 @@ use tempfile::TempDir;
 use whereabot::benchmark::Report;
 use whereabot::camera::Camera;
 use whereabot::cascade::{Estimate, Locator, Output, Status};
+use whereabot::draw::mask_image;
 use whereabot::network::Model;
 
 /// That of the bundled pictures, in degrees.
@@ -63,6 +64,48 @@ impl Bench {
              const model = await (await fetch('/model')).arrayBuffer();
              await engine.load(new Uint8Array(model), 'model');"
         ));
+    }
+
+    /// What an element says.
+    fn text(&mut self, id: &str) -> String {
+        let text = self
+            .page
+            .run(&format!("return document.getElementById('{id}').innerText"));
+        text.as_str().unwrap().to_owned()
+    }
+
+    fn wait_for(&mut self, id: &str, text: &str) {
+        let element = format!("document.getElementById('{id}').innerText");
+        self.page.wait_until(&format!("{element} === '{text}'"));
+    }
+
+    /// The table of joints is that of a bundled picture, as far as decoders of JPEG agree.
+    fn check_positions(&mut self, robot: &str, name: &str) {
+        let image = image::open(picture(name)).unwrap().into_rgba8();
+        let expected = locate_natively(&weights(robot), &image);
+        let rows = self.page.run(
+            "return Array.from(document.querySelectorAll('#positions tbody tr'),
+                (row) => Array.from(row.cells, (cell) => cell.innerText))",
+        );
+        let rows: Vec<[String; 4]> = serde_json::from_value(rows).unwrap();
+        assert_eq!(rows.len(), expected.joints.len());
+        for ([name, xyz @ ..], joint) in rows.iter().zip(&expected.joints) {
+            assert_eq!(*name, joint.name.replace('_', " "));
+            for (shown, metres) in xyz.iter().zip(joint.xyz_m) {
+                let shown: f64 = shown.parse().unwrap();
+                assert!(
+                    (shown - metres).abs() < 0.02,
+                    "{name}: {shown}, not {metres}"
+                );
+            }
+        }
+    }
+
+    /// Into a folder of Cargo's, for people.
+    fn save_screenshot(&mut self, name: &str) {
+        let file = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("{name}.png"));
+        std::fs::write(&file, self.page.screenshot(&Value::Null)).unwrap();
+        println!("{}", file.display());
     }
 
     /// What the engine of [`Bench::go_with_engine`] says about a picture: an expression in `script` that
@@ -197,18 +240,119 @@ fn a_benchmark_on_the_gpu_is_one_that_the_program_reads() {
 }
 
 #[test]
-fn the_page_shows_what_was_found() {
+fn the_page_on_the_gpu_shows_what_was_found() {
     let mut bench = Bench::open();
-    // As a browser without WebGPU.
-    bench.page.call(
-        "Page.addScriptToEvaluateOnNewDocument",
-        json!({"source": "delete Navigator.prototype.gpu"}),
+    bench.page.resize(1280, 800, 1, "light");
+    bench.go("?engine=gpu");
+    bench.wait_for("status", "UR5 found");
+    assert_eq!(bench.text("engine"), "google swiftshader");
+    bench.save_screenshot("desktop");
+
+    // The picture alone, pixel by pixel.
+    bench.page.run(
+        "document.getElementById('view').style = 'position: fixed; inset: 0; width: 512px; height: 424px; z-index: 1';
+         for (const id of ['joints', 'caption']) document.getElementById(id).hidden = true;
+         await new Promise(requestAnimationFrame)",
     );
-    bench.page.resize(390, 844, 2, "dark");
-    bench.go("");
+    let clip = json!({"x": 0, "y": 0, "width": 512, "height": 424, "scale": 1});
+    let shown = bench.page.screenshot(&clip);
+    let shown = image::load_from_memory(&shown).unwrap().into_rgb8();
+    let image = image::open(picture("ur5_3")).unwrap().into_rgba8();
+    let camera = Camera::from_hfov(512, 424, HFOV.to_radians());
+    let model = weights("ur5");
+    let mask = locate_natively(&model, &image).mask.unwrap();
+    let canonical = Model::from_bytes(&model, "model")
+        .unwrap()
+        .description
+        .camera;
+    let mask = mask_image(&mask, &canonical, &camera, None);
+    let mean_error = |strength: f32| {
+        let pixels = shown.pixels().zip(image.pixels()).zip(mask.pixels());
+        let errors = pixels.flat_map(|((shown, pixel), mask)| {
+            let share = strength * f32::from(mask.0[0]) / 255.0;
+            let tint = [0.0, 0.86, 0.43].map(|v| 255.0 * v);
+            [0, 1, 2].map(|i| {
+                let value = f32::from(pixel.0[i]);
+                (f32::from(shown.0[i]) - (value + (tint[i] - value) * share)).abs()
+            })
+        });
+        errors.sum::<f32>() / shown.as_raw().len() as f32
+    };
+    // Decoders of JPEG differ by a step or two.
+    assert!(mean_error(0.5) < 1.5, "{}", mean_error(0.5));
+    assert!(mean_error(0.0) > 3.0, "{}", mean_error(0.0));
+    assert!(bench.page.faults.is_empty(), "{:?}", bench.page.faults);
+}
+
+#[test]
+fn the_page_works_on_a_phone_without_webgpu() {
+    let mut bench = Bench::open();
+    let gone = json!({"source": "delete Navigator.prototype.gpu"});
     bench
         .page
-        .wait_until("document.getElementById('status').textContent === 'UR5 found'");
+        .call("Page.addScriptToEvaluateOnNewDocument", gone);
+    bench.page.resize(390, 844, 2, "dark");
+    bench.go("");
+    bench.wait_for("status", "UR5 found");
+    bench
+        .page
+        .wait_until("document.getElementById('notice').innerText.includes('no WebGPU')");
+    let fits = "document.documentElement.scrollWidth <= innerWidth";
+    assert_eq!(bench.page.run(&format!("return {fits}")), true);
+    bench.save_screenshot("phone");
+    bench.check_positions("ur5", "ur5_3");
+
+    bench
+        .page
+        .run("document.querySelector('[value=ur10]').click()");
+    bench.wait_for("status", "UR10 found");
+    bench.check_positions("ur10", "ur10_1");
+
+    let jpeg = picture("no_robot");
+    std::fs::copy(jpeg, bench.files.path().join("no_robot.jpg")).unwrap();
+    bench.page.run(
+        "const blob = await (await fetch('/no_robot.jpg')).blob();
+         const files = new DataTransfer();
+         files.items.add(new File([blob], 'no_robot.jpg', { type: 'image/jpeg' }));
+         document.getElementById('image').files = files.files;
+         document.getElementById('image').dispatchEvent(new Event('change'))",
+    );
+    bench.wait_for("status", "No robot");
+
+    bench
+        .page
+        .run("document.querySelector('[value=ur5]').click()");
+    bench.page.run("document.getElementById('camera').click()");
+    bench.wait_for("status", "UR5 found");
+    bench
+        .page
+        .wait_until("Number(document.getElementById('rate').innerText) > 0");
+    bench.page.run("document.getElementById('pause').click()");
+
+    let permissions = json!({"permissions": ["clipboardReadWrite", "clipboardSanitizedWrite"]});
+    bench.page.call("Browser.grantPermissions", permissions);
+    bench.page.run("document.getElementById('measure').click()");
+    bench
+        .page
+        .wait_until("!document.getElementById('copy').hidden");
+    bench.page.run("document.getElementById('copy').click()");
+    bench.wait_for("copy", "Copied");
+    let copied = bench
+        .page
+        .run("return await navigator.clipboard.readText()");
+    let report = Report::from_json(copied.as_str().unwrap().as_bytes()).unwrap();
+    assert_eq!(
+        (
+            report.adapter.backend.as_str(),
+            report.weights.robot.as_str()
+        ),
+        ("rust", "ur5")
+    );
+    let rows = bench
+        .page
+        .run("return document.querySelectorAll('#layers tbody tr').length");
+    assert_eq!(rows, report.layers.len());
+    assert!(bench.page.faults.is_empty(), "{:?}", bench.page.faults);
 }
 
 fn joints_in(answer: &Value) -> Vec<[f64; 3]> {

@@ -23,8 +23,8 @@ pub struct Page {
 }
 
 impl Page {
-    /// WebGPU on a CPU. Its software compiles kernels for seconds, and runs them in the same time.
-    const PATIENCE: Duration = Duration::from_secs(120);
+    /// WebGPU in software takes seconds for a picture, and more on a busy machine.
+    const PATIENCE: Duration = Duration::from_secs(240);
 
     /// Opens a page on nothing, with WebGPU and a webcam that plays `webcam`, a file of JPEG pictures.
     pub fn open(webcam: &Path) -> Self {
@@ -177,9 +177,13 @@ impl Page {
         self.call("Emulation.setEmulatedMedia", json!({"features": theme}));
     }
 
-    /// The page as a PNG.
-    pub fn screenshot(&mut self) -> Vec<u8> {
-        let picture = self.call("Page.captureScreenshot", json!({}));
+    /// The page, or the part `clip` of it, as a PNG.
+    pub fn screenshot(&mut self, clip: &Value) -> Vec<u8> {
+        let parameters = match clip {
+            Value::Null => json!({}),
+            clip => json!({"clip": clip}),
+        };
+        let picture = self.call("Page.captureScreenshot", parameters);
         BASE64_STANDARD
             .decode(picture["data"].as_str().unwrap())
             .unwrap()
