@@ -23,6 +23,9 @@ function inTurn(task) {
 function complain(error) {
   $('notice').textContent = error.message ?? error;
   $('notice').hidden = false;
+  if (!engine?.gpu) return;
+  const link = Object.assign(document.createElement('a'), { href: '?engine=cpu', textContent: 'Run without the GPU' });
+  $('notice').append(' ', link);
 }
 
 // Runs what a person asked for.
