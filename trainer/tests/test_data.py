@@ -130,3 +130,13 @@ def test_negatives_fill_the_input(tmp_path):
         assert photographs[1, 100, 100].tolist() == [10, 200, 30]
     with pytest.raises(data.RecordingError, match="no photographs"):
         data.read_negatives([tmp_path / "cache"], tmp_path / "cache")
+
+
+def test_jittered_masks_move_only_where_they_are_not_sure():
+    torch.manual_seed(0)
+    masks = torch.tensor([0.0, 0.02, 0.4, 0.6, 0.98, 1.0]).repeat(500, 1)[:, None, None]
+    varied = data.jitter_masks(masks)[:, 0, 0]
+    changed = ((varied >= 0.5) != (masks[:, 0, 0] >= 0.5)).float().mean(0)
+    assert varied.min() >= 0 and varied.max() <= 1
+    assert (changed[[0, 5]] == 0).all() and (changed[[1, 4]] < 0.01).all()
+    assert (changed[[2, 3]] > 0.2).all()

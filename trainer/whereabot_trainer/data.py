@@ -235,6 +235,16 @@ def _uniform(count, low, high, *shape):
     return torch.empty(count, *shape).uniform_(low, high)
 
 
+def jitter_masks(masks):
+    """Another estimate of the same: probabilities moved, as a whole and each by itself, where they are not sure.
+
+    A joint network that never sees other borders leans on single pixels: one more or less moved joints by millimetres.
+    From f32 [N, 1, H, W] in [0, 1] to the same.
+    """
+    logits = torch.logit(masks, eps=1 / 255)
+    return torch.sigmoid(logits + torch.randn(len(masks), 1, 1, 1) + 0.5 * torch.randn_like(masks))
+
+
 def jitter_colours(images):
     """Other light and another camera: gain, white balance, gamma, saturation, contrast, blur and noise.
 

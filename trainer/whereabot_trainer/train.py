@@ -450,7 +450,8 @@ def train_joint(args):
         images, masks = samples.bytes(batch)
         if estimated is not None and progress >= args.estimated_after:
             for row in torch.nonzero(torch.rand(len(batch), device="cpu") < args.estimated_masks).flatten():
-                masks[row, 0] = torch.from_numpy(estimated[int(batch[row])]).float() / 255
+                estimate = torch.from_numpy(estimated[int(batch[row])])[None, None].float() / 255
+                masks[row] = data.jitter_masks(estimate)[0]
         images, masks = data.jitter_colours(images.to(args.device)), masks.to(args.device)
         overlays, truth = overlay(images, masks, rule), joints[batch].to(args.device)
         if args.camera == "free":
