@@ -23,9 +23,14 @@ function inTurn(task) {
 function complain(error) {
   $('notice').textContent = error.message ?? error;
   $('notice').hidden = false;
+}
+
+// For what the engine says while it searches.
+function complainOfEngine(error) {
+  complain(error);
   if (!engine?.gpu) return;
   const link = Object.assign(document.createElement('a'), { href: '?engine=cpu', textContent: 'Run without the GPU' });
-  $('notice').append(' ', link);
+  $('notice').append('. ', link);
 }
 
 // Runs what a person asked for.
@@ -55,7 +60,7 @@ async function refresh() {
       if (source.live) await nextFrame(source.picture);
     }
   } catch (error) {
-    complain(error);
+    complainOfEngine(error);
   } finally {
     running = false;
   }
@@ -308,7 +313,7 @@ for (const event of ['dragover', 'dragleave', 'drop']) {
 }
 
 // A defect in the engine leaves nothing to wait for.
-addEventListener('error', ({ message }) => complain(message));
+addEventListener('error', ({ message }) => complainOfEngine(message));
 
 attempt(async () => {
   const opened = await open($('picture'), new URLSearchParams(location.search).get('engine'));

@@ -19,7 +19,7 @@ pub struct Gpu {
     adapter: String,
     screen: Screen,
     finder: Option<Finder>,
-    picture: Option<wgpu::Texture>,
+    picture: Option<wgpu::TextureView>,
     frame: u64,
 }
 
@@ -73,8 +73,7 @@ impl Gpu {
         height: u32,
         hfov: f64,
     ) -> Result<String, JsError> {
-        let texture = self.take(&picture, width, height)?;
-        let view = texture.create_view(&Default::default());
+        let view = self.take(&picture, width, height)?;
         let camera = Camera::from_hfov(width, height, hfov.to_radians());
         let finder = self.finder.as_mut().ok_or_else(not_loaded)?;
         let locator = &mut finder.locator;
@@ -126,28 +125,31 @@ impl Gpu {
         picture: &JsValue,
         width: u32,
         height: u32,
-    ) -> Result<wgpu::Texture, JsError> {
+    ) -> Result<wgpu::TextureView, JsError> {
         let size = wgpu::Extent3d {
             width,
             height,
             depth_or_array_layers: 1,
         };
-        let texture = match self.picture.take() {
-            Some(texture) if texture.size() == size => texture,
-            _ => self.device.wgpu().create_texture(&wgpu::TextureDescriptor {
-                label: Some("picture"),
-                size,
-                mip_level_count: 1,
-                sample_count: 1,
-                dimension: wgpu::TextureDimension::D2,
-                format: wgpu::TextureFormat::Rgba8Unorm,
-                // A browser renders what it copies.
-                usage: wgpu::TextureUsages::TEXTURE_BINDING
-                    | wgpu::TextureUsages::COPY_DST
-                    | wgpu::TextureUsages::RENDER_ATTACHMENT,
-                view_formats: &[],
-            }),
-        };
+        let view = self
+            .picture
+            .take_if(|view| view.texture().size() == size)
+            .unwrap_or_else(|| {
+                let texture = self.device.wgpu().create_texture(&wgpu::TextureDescriptor {
+                    label: Some("picture"),
+                    size,
+                    mip_level_count: 1,
+                    sample_count: 1,
+                    dimension: wgpu::TextureDimension::D2,
+                    format: wgpu::TextureFormat::Rgba8Unorm,
+                    // A browser renders what it copies.
+                    usage: wgpu::TextureUsages::TEXTURE_BINDING
+                        | wgpu::TextureUsages::COPY_DST
+                        | wgpu::TextureUsages::RENDER_ATTACHMENT,
+                    view_formats: &[],
+                });
+                texture.create_view(&Default::default())
+            });
         let source = if let Some(video) = picture.dyn_ref::<HtmlVideoElement>() {
             wgpu::ExternalImageSource::HTMLVideoElement(video.clone())
         } else if let Some(bitmap) = picture.dyn_ref::<ImageBitmap>() {
@@ -162,7 +164,7 @@ impl Gpu {
                 flip_y: false,
             },
             wgpu::CopyExternalImageDestInfo {
-                texture: &texture,
+                texture: view.texture(),
                 mip_level: 0,
                 origin: wgpu::Origin3d::ZERO,
                 aspect: wgpu::TextureAspect::All,
@@ -171,8 +173,8 @@ impl Gpu {
             },
             size,
         );
-        self.picture = Some(texture.clone());
-        Ok(texture)
+        self.picture = Some(view.clone());
+        Ok(view)
     }
 }
 

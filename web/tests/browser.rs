@@ -56,8 +56,12 @@ impl Bench {
 
     /// Opens nothing, with an engine of its own, and a model in it.
     fn go_with_engine(&mut self, engine: &str, model: &[u8]) {
-        std::fs::write(self.files.path().join("model"), model).unwrap();
         self.go("empty");
+        self.load_engine(engine, model);
+    }
+
+    fn load_engine(&mut self, engine: &str, model: &[u8]) {
+        std::fs::write(self.files.path().join("model"), model).unwrap();
         self.page.run(&format!(
             "const {{ open }} = await import('/engine.js');
              window.engine = (await open(document.createElement('canvas'), '{engine}')).engine;
@@ -217,6 +221,42 @@ fn a_webcam_on_the_gpu_is_found_as_natively() {
          const { videoWidth: width, videoHeight: height } = source",
     );
     webcam.check(&model);
+}
+
+#[test]
+fn a_gpu_that_fails_gives_an_error_and_no_answer() {
+    let model = small(&weights("ur5"));
+    let mut bench = Bench::open();
+    let locate = "const source = await createImageBitmap(new ImageData(64, 64));
+                  return await engine.locate(source, 64, 64, 70).then(JSON.stringify, String)";
+
+    // A browser that does not understand a kernel.
+    bench.go("empty");
+    bench.page.run(
+        "const { createShaderModule } = GPUDevice.prototype;
+         GPUDevice.prototype.createShaderModule = function (descriptor) {
+             const code = descriptor.code.replaceAll('workgroup_size', 'workgroup_sighs');
+             return createShaderModule.call(this, { ...descriptor, code });
+         }",
+    );
+    bench.load_engine("gpu", &model);
+    let answer = bench.page.run(locate);
+    assert!(answer.as_str().unwrap().contains("validation"), "{answer}");
+
+    // A device that is lost.
+    bench.go("empty");
+    bench.page.run(
+        "const { requestDevice } = GPUAdapter.prototype;
+         GPUAdapter.prototype.requestDevice = async function (descriptor) {
+             return (window.device = await requestDevice.call(this, descriptor));
+         }",
+    );
+    bench.load_engine("gpu", &model);
+    let answer = bench.page.run(locate);
+    assert!(answer.as_str().unwrap().contains("status"), "{answer}");
+    bench.page.run("device.destroy()");
+    let answer = bench.page.run(locate);
+    assert!(answer.as_str().unwrap().contains("lost"), "{answer}");
 }
 
 #[test]

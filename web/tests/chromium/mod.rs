@@ -59,7 +59,11 @@ impl Page {
                 "--disable-quic",
                 "--disable-background-networking",
             ])
-            .args(["--disable-component-update", "--disable-sync"])
+            .args([
+                "--disable-component-update",
+                "--disable-sync",
+                "--hide-scrollbars",
+            ])
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
