@@ -8,9 +8,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use common::{description, difference, joints, model_file, noise};
+use common::{ORIENTATIONS, description, difference, joints, model_file, noise};
 use image::{DynamicImage, Rgba, RgbaImage};
-use whereabot::camera::{Camera, Crop, Orientation, Unrectification};
+use whereabot::camera::{Camera, Crop, Unrectification};
 use whereabot::cascade::{
     Estimate, HostLocator, HostOptions, LocateError, Located, Locator, MaskSize, Output, Source,
     Status,
@@ -283,17 +283,6 @@ fn the_answers_are_those_of_our_own_device() {
         assert!(wrong > 0.02, "{wrong}");
     }
 }
-
-const ORIENTATIONS: [Orientation; 8] = [
-    Orientation::NoTransforms,
-    Orientation::Rotate90,
-    Orientation::Rotate180,
-    Orientation::Rotate270,
-    Orientation::FlipHorizontal,
-    Orientation::FlipVertical,
-    Orientation::Rotate90FlipH,
-    Orientation::Rotate270FlipH,
-];
 
 #[test]
 fn a_part_of_a_turned_texture_is_what_it_is_upright() {

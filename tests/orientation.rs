@@ -1,20 +1,12 @@
 //! Turned and cropped cameras, and the frame and projection of graphics.
 #![allow(clippy::unwrap_used, missing_docs)]
 
+mod common;
+
+use common::ORIENTATIONS;
 use glam::{Vec3, Vec4Swizzles};
 use whereabot::camera::graphics::{projection, to_graphics};
 use whereabot::camera::{Camera, Crop, Distortion, Intrinsics, Orientation, Texels};
-
-const ORIENTATIONS: [Orientation; 8] = [
-    Orientation::NoTransforms,
-    Orientation::Rotate90,
-    Orientation::Rotate180,
-    Orientation::Rotate270,
-    Orientation::FlipHorizontal,
-    Orientation::FlipVertical,
-    Orientation::Rotate90FlipH,
-    Orientation::Rotate270FlipH,
-];
 
 fn sensor() -> Camera {
     Camera {

@@ -3,10 +3,10 @@
 
 mod common;
 
-use common::{cases, device, difference, noise, run_step};
+use common::{ORIENTATIONS, cases, device, difference, noise, run_step};
 use image::{DynamicImage, Rgba, RgbaImage};
 use proptest::prelude::*;
-use whereabot::camera::{Camera, Crop, Distortion, Intrinsics, Orientation, Rectification, Texels};
+use whereabot::camera::{Camera, Crop, Distortion, Intrinsics, Rectification, Texels};
 use whereabot::gpu::{Planes, Rectify, Tensor, Yuv};
 use whereabot::network::Shape;
 use whereabot::reference;
@@ -351,17 +351,6 @@ fn nv12_shows_the_same_in_each_encoding() {
         assert!(wrong > 0.02, "{written:?}: {wrong}");
     }
 }
-
-const ORIENTATIONS: [Orientation; 8] = [
-    Orientation::NoTransforms,
-    Orientation::Rotate90,
-    Orientation::Rotate180,
-    Orientation::Rotate270,
-    Orientation::FlipHorizontal,
-    Orientation::FlipVertical,
-    Orientation::Rotate90FlipH,
-    Orientation::Rotate270FlipH,
-];
 
 proptest! {
     #![proptest_config(cases(24))]

@@ -112,8 +112,8 @@ proptest! {
 
 #[test]
 fn a_straight_border_is_where_the_lens_shows_it() {
-    // Robot is what lies right of the plane x = 0.2 z.
-    let border = |ray: [f64; 2]| f32::from(ray[0] > 0.2);
+    // Robot is what lies right of the plane x = 0.44 z.
+    let border = |ray: [f64; 2]| f32::from(ray[0] > 0.44);
     let mask: Vec<f32> = (0..SHAPE.len())
         .map(|at| ((at % 64) as f64 - 31.5) / 45.6)
         .map(|x| border([x, 0.0]))
@@ -138,7 +138,7 @@ fn a_straight_border_is_where_the_lens_shows_it() {
                 continue;
             }
             // Between two pixels of the mask it may be either.
-            let clear = (ray[0] - 0.2).abs() > 0.7 / 45.6;
+            let clear = (ray[0] - 0.44).abs() > 0.7 / 45.6;
             wrong += usize::from(clear && (value - border(ray)).abs() > 0.01);
         }
         wrong

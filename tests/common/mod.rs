@@ -9,6 +9,7 @@
 
 use std::sync::{Arc, OnceLock};
 
+use whereabot::camera::Orientation;
 use whereabot::cascade::Estimate;
 use whereabot::gpu::{AdapterRequest, Conv2dKernel, Device, Layout, NetworkPlan, Precision};
 use whereabot::network::{Layer, Network, Operation, Parameters, Shape};
@@ -22,6 +23,18 @@ pub fn joints(estimate: &Estimate) -> Vec<f32> {
         .flat_map(|j| j.xyz_m.map(|v| v as f32))
         .collect()
 }
+
+/// Every orientation that EXIF has.
+pub const ORIENTATIONS: [Orientation; 8] = [
+    Orientation::NoTransforms,
+    Orientation::Rotate90,
+    Orientation::Rotate180,
+    Orientation::Rotate270,
+    Orientation::FlipHorizontal,
+    Orientation::FlipVertical,
+    Orientation::Rotate90FlipH,
+    Orientation::Rotate270FlipH,
+];
 
 /// How often a property is tried. Failures print their case; they are kept as tests by hand.
 pub fn cases(count: u32) -> proptest::test_runner::Config {
