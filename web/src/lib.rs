@@ -1,6 +1,8 @@
 //! What the page's scripts call: a robot's model on the browser's GPU ([`Gpu`]) or in plain Rust
 //! ([`Cpu`]). Answers are JSON; see `answer.rs`.
 #![cfg(target_arch = "wasm32")]
+// The library shares devices by `Arc`; here there is one thread.
+#![allow(clippy::arc_with_non_send_sync)]
 
 mod answer;
 mod cpu;
