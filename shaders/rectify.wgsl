@@ -62,23 +62,21 @@ fn ray_of(pixel: vec2<f32>) -> vec2<f32> {
     return (pixel - params.canonical.zw) * params.canonical.xy;
 }
 
-fn load(at: vec2<i32>) -> vec3<f32> {
-    let inside = all(at >= vec2(0)) && all(at < vec2<i32>(params.size));
-    let near = clamp(at, vec2(0), vec2<i32>(params.size) - 1);
-    let texel = params.origin + params.across * near.x + params.down * near.y;
-    return select(vec3(0.0), source_at(texel), inside);
-}
-
-// Bilinear, as if black pixels lay round the source: without a step at its border.
+// Bilinear, as if black pixels lay round the source: without a step at its border. What lies beyond it may be
+// read, but weighs nothing.
 fn sample(at: vec2<f32>) -> vec3<f32> {
     if !(all(at > vec2(-1.0)) && all(at < params.size)) {
         return vec3(0.0);
     }
     let corner = vec2<i32>(floor(at));
     let part = at - floor(at);
-    let top = mix(load(corner), load(corner + vec2(1, 0)), part.x);
-    let bottom = mix(load(corner + vec2(0, 1)), load(corner + vec2(1, 1)), part.x);
-    return mix(top, bottom, part.y);
+    let before = select(vec2(0.0), 1.0 - part, corner >= vec2(0));
+    let behind = select(vec2(0.0), part, corner + 1 < vec2<i32>(params.size));
+    let texel = params.origin + params.across * corner.x + params.down * corner.y;
+    let top = source_at(texel) * before.x + source_at(texel + params.across) * behind.x;
+    let below = texel + params.down;
+    let bottom = source_at(below) * before.x + source_at(below + params.across) * behind.x;
+    return top * before.y + bottom * behind.y;
 }
 
 @compute @workgroup_size(64)
