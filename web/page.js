@@ -320,6 +320,8 @@ attempt(async () => {
   engine = opened.engine;
   $('engine').textContent = engine.name;
   await loadRobot();
+  document.querySelector('.stage').inert = false;
+  $('measure').disabled = false;
   await useSample();
   if (opened.why) complain(`${opened.why}: the networks run in plain Rust on one core of this device.`);
 });
