@@ -1,7 +1,8 @@
 use std::sync::OnceLock;
-use std::time::Instant;
 
-/// Milliseconds since the first call. The only clock of a benchmark: a browser has another one.
+use web_time::Instant;
+
+/// Milliseconds since the first call. The only clock of a benchmark.
 pub(super) fn now_ms() -> f64 {
     static START: OnceLock<Instant> = OnceLock::new();
     START.get_or_init(Instant::now).elapsed().as_secs_f64() * 1e3

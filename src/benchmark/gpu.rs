@@ -11,7 +11,7 @@ use crate::camera::Rectification;
 use crate::gpu::{Device, GpuError, Plan, Precision, Step, Work};
 use crate::network::Model;
 
-pub(super) fn measure(
+pub(super) async fn measure(
     device: &Device,
     model: &Model,
     weights: Weights,
@@ -21,14 +21,14 @@ pub(super) fn measure(
     progress("what the adapter can reach");
     let features = device.wgpu().features();
     let mut timestamps = options.timestamps && features.contains(wgpu::Features::TIMESTAMP_QUERY);
-    let probe = |timestamps| {
+    let probe = async |timestamps| {
         let timer = Timer::new(device, 1, timestamps)?;
-        Roofline::measure(device, &timer)
+        Roofline::measure(device, &timer).await
     };
-    let mut roofline = probe(timestamps).map_err(BenchmarkError::Probe)?;
+    let mut roofline = probe(timestamps).await.map_err(BenchmarkError::Probe)?;
     if roofline.is_none() {
         timestamps = false;
-        roofline = probe(timestamps).map_err(BenchmarkError::Probe)?;
+        roofline = probe(timestamps).await.map_err(BenchmarkError::Probe)?;
     }
     let mut report = Report {
         schema: Report::SCHEMA,
@@ -48,14 +48,15 @@ pub(super) fn measure(
     };
     for &precision in &options.precisions {
         for &batch in &options.batches {
-            let planned = Batch::plan(device, model, batch, precision, timestamps);
-            let measured = planned.and_then(|mut planned| {
+            let mut measure = async || {
+                let mut planned = Batch::plan(device, model, batch, precision, timestamps)?;
                 progress(&format!("batch {batch}, {precision}: cascade"));
-                let cascade = planned.cascade(device, precision, options)?;
+                let cascade = planned.cascade(device, precision, options).await?;
                 progress(&format!("batch {batch}, {precision}: layers"));
-                let layers = planned.layers(device, precision, options, roofline.as_ref())?;
-                Ok((cascade, layers))
-            });
+                let layers = planned.layers(device, precision, options, roofline.as_ref());
+                Ok((cascade, layers.await?))
+            };
+            let measured = measure().await;
             let (cascade, layers) =
                 measured.map_err(|cause| BenchmarkError::Batch { batch, cause })?;
             report.cascade.push(cascade);
@@ -108,7 +109,7 @@ impl Batch {
         })
     }
 
-    fn cascade(
+    async fn cascade(
         &mut self,
         device: &Device,
         precision: Precision,
@@ -116,14 +117,14 @@ impl Batch {
     ) -> Result<CascadeFigures, GpuError> {
         let timer = Timer::new(device, 1, self.timestamps)?;
         let start = now_ms();
-        self.run(device, &timer)?;
+        self.run(device, &timer).await?;
         let first_ms = now_ms() - start;
 
         let mut samples: [Sample; 6] = Default::default();
         let start = now_ms();
         let mut runs = 0;
         while !options.enough(runs, now_ms() - start) {
-            let run = self.run(device, &timer)?;
+            let run = self.run(device, &timer).await?;
             let compute = run.submit + run.wait;
             let all = run.upload + compute + run.readback;
             // Some drivers do the GPU's work while they take the submission.
@@ -163,8 +164,8 @@ impl Batch {
         })
     }
 
-    /// As [`Plan::run`], with a look at the clock between its parts.
-    fn run(&mut self, device: &Device, timer: &Timer) -> Result<Run, GpuError> {
+    /// As [`Plan::run_async`], with a look at the clock between its parts.
+    async fn run(&mut self, device: &Device, timer: &Timer) -> Result<Run, GpuError> {
         let start = now_ms();
         for index in 0..self.batch {
             self.plan
@@ -182,12 +183,12 @@ impl Batch {
         }
         device.queue().submit([encoder.finish()]);
         let submitted = now_ms();
-        device.wait()?;
+        device.wait_async().await?;
         let done = now_ms();
-        pollster::block_on(self.plan.read_async(device, true, false))?;
+        self.plan.read_async(device, true, false).await?;
         let read = now_ms();
         let gpu = match timer {
-            Timer::Timestamps(timestamps) => timestamps.read(device)?.first().copied(),
+            Timer::Timestamps(timestamps) => timestamps.read(device).await?.first().copied(),
             Timer::Wall => None,
         };
         Ok(Run {
@@ -199,7 +200,7 @@ impl Batch {
         })
     }
 
-    fn layers(
+    async fn layers(
         &self,
         device: &Device,
         precision: Precision,
@@ -214,12 +215,12 @@ impl Batch {
             }
         }
         let timer = Timer::new(device, passes.len(), self.timestamps)?;
-        timer.time(device, &passes)?;
+        timer.time(device, &passes).await?;
         let mut samples = vec![Sample::default(); passes.len()];
         let start = now_ms();
         let mut runs = 0;
         while !options.enough(runs, now_ms() - start) {
-            for (sample, ms) in samples.iter_mut().zip(timer.time(device, &passes)?) {
+            for (sample, ms) in samples.iter_mut().zip(timer.time(device, &passes).await?) {
                 sample.push(ms);
             }
             runs += 1;

@@ -88,6 +88,7 @@ pub type Progress<'a> = &'a mut dyn FnMut(&str);
 ///
 /// # Errors
 /// A batch that the adapter cannot hold, any fault of the device.
+#[cfg(not(target_arch = "wasm32"))]
 pub fn on_gpu(
     device: &Device,
     model: &Model,
@@ -95,7 +96,21 @@ pub fn on_gpu(
     options: &Options,
     progress: Progress<'_>,
 ) -> Result<Report, BenchmarkError> {
-    gpu::measure(device, model, weights, options, progress)
+    pollster::block_on(on_gpu_async(device, model, weights, options, progress))
+}
+
+/// As [`on_gpu`]: in a browser without blocking, elsewhere blocking all the same.
+///
+/// # Errors
+/// Those.
+pub async fn on_gpu_async(
+    device: &Device,
+    model: &Model,
+    weights: Weights,
+    options: &Options,
+    progress: Progress<'_>,
+) -> Result<Report, BenchmarkError> {
+    gpu::measure(device, model, weights, options, progress).await
 }
 
 /// Measures `model` in plain Rust.

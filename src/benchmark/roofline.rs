@@ -19,12 +19,12 @@ const RUNS: usize = 5;
 
 impl Roofline {
     /// `None` where the adapter's clock stands still.
-    pub(super) fn measure(device: &Device, timer: &Timer) -> Result<Option<Self>, GpuError> {
-        let best_of = |steps: Vec<&Step>| -> Result<f64, GpuError> {
+    pub(super) async fn measure(device: &Device, timer: &Timer) -> Result<Option<Self>, GpuError> {
+        let best_of = async |steps: Vec<&Step>| -> Result<f64, GpuError> {
             let passes = [steps];
             let mut best = f64::INFINITY;
             for _ in 0..RUNS {
-                let times = timer.time(device, &passes)?;
+                let times = timer.time(device, &passes).await?;
                 best = best.min(times.iter().sum());
             }
             Ok(best)
@@ -33,30 +33,31 @@ impl Roofline {
         let probe = ArithmeticProbe::new(device)?;
         let mut rounds = 16;
         // The first run compiles.
-        timer.time(device, &[vec![probe.step(device, rounds).0]])?;
+        let (step, _) = probe.step(device, rounds);
+        timer.time(device, &[vec![step]]).await?;
         while rounds < 1 << 20 {
             let (step, _) = probe.step(device, rounds);
-            let times = timer.time(device, &[vec![step]])?;
+            let times = timer.time(device, &[vec![step]]).await?;
             if times.iter().sum::<f64>() >= LONG_ENOUGH_MS {
                 break;
             }
             rounds *= 2;
         }
         let (step, work) = probe.step(device, rounds);
-        let gflop_per_s = work.operations as f64 * 1e-6 / best_of(vec![step])?;
+        let gflop_per_s = work.operations as f64 * 1e-6 / best_of(vec![step]).await?;
 
         let step = copy_probe(device)?;
         let mut copies = 1;
-        timer.time(device, &[vec![&step]])?;
+        timer.time(device, &[vec![&step]]).await?;
         while copies < 256 {
-            let times = timer.time(device, &[vec![&step; copies]])?;
+            let times = timer.time(device, &[vec![&step; copies]]).await?;
             if times.iter().sum::<f64>() >= LONG_ENOUGH_MS {
                 break;
             }
             copies *= 2;
         }
         let bytes = step.work().bytes as f64 * copies as f64;
-        let gb_per_s = bytes * 1e-6 / best_of(vec![&step; copies])?;
+        let gb_per_s = bytes * 1e-6 / best_of(vec![&step; copies]).await?;
 
         let usable = gflop_per_s.is_finite() && gb_per_s.is_finite();
         Ok(usable.then_some(Self {

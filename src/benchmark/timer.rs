@@ -20,7 +20,7 @@ impl Timer {
     }
 
     /// Runs each list of steps in a pass of its own, and waits: milliseconds of each.
-    pub fn time(&self, device: &Device, passes: &[Vec<&Step>]) -> Result<Vec<f64>, GpuError> {
+    pub async fn time(&self, device: &Device, passes: &[Vec<&Step>]) -> Result<Vec<f64>, GpuError> {
         let encoder = || device.wgpu().create_command_encoder(&Default::default());
         let record = |encoder: &mut wgpu::CommandEncoder, steps: &[&Step], timestamp_writes| {
             let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
@@ -40,21 +40,22 @@ impl Timer {
                 }
                 timestamps.resolve(&mut encoder, passes.len() as u32);
                 device.queue().submit([encoder.finish()]);
-                let mut times = timestamps.read(device)?;
+                let mut times = timestamps.read(device).await?;
                 times.truncate(passes.len());
                 Ok(times)
             }
-            Self::Wall => passes
-                .iter()
-                .map(|steps| {
+            Self::Wall => {
+                let mut times = Vec::new();
+                for steps in passes {
                     let start = now_ms();
                     let mut encoder = encoder();
                     record(&mut encoder, steps, None);
                     device.queue().submit([encoder.finish()]);
-                    device.wait()?;
-                    Ok(now_ms() - start)
-                })
-                .collect(),
+                    device.wait_async().await?;
+                    times.push(now_ms() - start);
+                }
+                Ok(times)
+            }
         }
     }
 }
@@ -109,11 +110,12 @@ impl Timestamps {
     }
 
     /// Milliseconds of each pass. Waits for what was submitted before.
-    pub fn read(&self, device: &Device) -> Result<Vec<f64>, GpuError> {
-        device.read(&self.staging, |bytes| {
+    pub async fn read(&self, device: &Device) -> Result<Vec<f64>, GpuError> {
+        let times = device.read_async(&self.staging, |bytes| {
             let times: Vec<[u64; 2]> = bytemuck::pod_collect_to_vec(bytes);
             let span = |[begin, end]: [u64; 2]| end.saturating_sub(begin) as f64 * self.period_ms;
             times.into_iter().map(span).collect()
-        })
+        });
+        times.await
     }
 }

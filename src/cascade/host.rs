@@ -275,6 +275,16 @@ impl HostLocator {
         self.outputs.masks().get(index).map(|mask| mask.view())
     }
 
+    /// The probabilities that the masks show, in full precision: `[image][row][column]`, of the network's size
+    /// in the canonical camera of the model, of the last frame that was submitted. Submits a copy and waits
+    /// for it: in a browser without blocking, elsewhere blocking all the same.
+    ///
+    /// # Errors
+    /// As [`Device::wait`].
+    pub async fn probabilities_async(&self) -> Result<Vec<f32>, LocateError> {
+        Ok(self.plan.mask().read_async(&self.device).await?)
+    }
+
     /// What was found, for the host's shaders: `array<Estimate>`, one an image of the batch, in a storage
     /// buffer with the usages `STORAGE` and `COPY_SRC`. [`HostLocator::wgsl`] is its declaration.
     pub fn estimates(&self) -> &wgpu::Buffer {

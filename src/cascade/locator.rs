@@ -2,8 +2,10 @@ use std::sync::Arc;
 
 use image::RgbaImage;
 
+use super::Estimate;
+#[cfg(not(target_arch = "wasm32"))]
+use super::Mask;
 use super::view::View;
-use super::{Estimate, Mask};
 use crate::camera::{Camera, Crop, Rectification, Texels};
 use crate::gpu::{Device, Frame, GpuError, Plan, Precision};
 use crate::network::{Description, Model};

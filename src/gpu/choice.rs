@@ -1,6 +1,7 @@
 use std::fmt;
 
 use super::conv2d::{Conv2d, Tiling, buffer, cooperative, subgroup_one, texture, tiled};
+use super::layout::is_rasteriser;
 use super::step::Step;
 use super::{Device, GpuError, Layout, Tier};
 
@@ -82,7 +83,7 @@ impl Conv2dKernel {
             Self::Cooperative => false,
             Self::Tiled(pixels) => {
                 let enough = pixels == 2 || Tiling::new(conv, pixels).workgroups() >= 256;
-                enough && device.info().device_type != wgpu::DeviceType::Cpu
+                enough && !is_rasteriser(device.info())
             }
             _ => true,
         }

@@ -371,6 +371,8 @@ impl Device {
         #[cfg(not(target_arch = "wasm32"))]
         self.wait()?;
         mapping.finish(self).await?;
+        // A browser tells by now what it refused before: what then was mapped is no result.
+        self.check()?;
         mapped(buffer, read)
     }
 }

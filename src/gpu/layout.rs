@@ -52,9 +52,10 @@ impl Layout {
     /// What suits an adapter for 32-bit floats. CPU rasterisers read storage textures several times faster than
     /// buffers; GPUs want buffers.
     pub(super) fn of(info: &wgpu::AdapterInfo) -> Self {
-        match info.device_type {
-            wgpu::DeviceType::Cpu => Self::Texture,
-            _ => Self::Buffer,
+        if is_rasteriser(info) {
+            Self::Texture
+        } else {
+            Self::Buffer
         }
     }
 }
@@ -67,4 +68,10 @@ impl fmt::Display for Layout {
             Self::Texture => "texture",
         })
     }
+}
+
+/// Whether kernels for CPU rasterisers are for this adapter. A browser's is a GPU to us even where it is software:
+/// there plain Rust is faster than any kernel, and tests run what browsers run on GPUs.
+pub(super) fn is_rasteriser(info: &wgpu::AdapterInfo) -> bool {
+    info.device_type == wgpu::DeviceType::Cpu && info.backend != wgpu::Backend::BrowserWebGpu
 }

@@ -147,7 +147,7 @@ impl Plan {
     }
 
     /// The mask network's output: probabilities `[1, height, width]`.
-    pub(super) fn mask(&self) -> &Tensor {
+    pub fn mask(&self) -> &Tensor {
         self.mask.output()
     }
 
