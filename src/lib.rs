@@ -14,6 +14,7 @@ pub mod network;
 #[cfg(feature = "recording")]
 pub mod recording;
 pub mod reference;
+pub mod verification;
 
 /// The library's example in the README is compiled with the tests.
 #[cfg(all(doctest, feature = "cli"))]

@@ -61,6 +61,30 @@ fn more_workgroups_than_one_dimension_holds() {
 }
 
 #[test]
+fn layers_write_to_their_places() {
+    let conv = |name: &str, out_channels| Layer {
+        name: name.into(),
+        inputs: vec!["input".into()],
+        operation: Operation::Conv2d {
+            out_channels,
+            kernel: 3,
+            dilation: 1,
+            activation: Activation::None,
+        },
+    };
+    for first in [3, 4, 8] {
+        let concat = Layer {
+            name: "concat".into(),
+            inputs: vec!["first".into(), "second".into()],
+            operation: Operation::Concat,
+        };
+        let layers = vec![conv("first", first), conv("second", 5), concat];
+        let network = network(layers, Shape::new(3, 6, 7), 1);
+        check_network(&network, 2, 2, 1e-5);
+    }
+}
+
+#[test]
 fn channels_keep_their_order() {
     let input = Shape::new(3, 2, 2);
     let network = network(

@@ -1,14 +1,17 @@
-//! Every kernel is valid WGSL and translates to every language that a backend speaks.
+//! Every kernel is valid WGSL and translates to every language that a backend speaks; what it becomes
+//! compiles, where a compiler runs here.
 #![allow(clippy::unwrap_used, clippy::panic, missing_docs)]
 
 use std::collections::BTreeSet;
+use std::io::Write;
 use std::path::Path;
+use std::process::{Command, Stdio};
 
 use naga::back::{PipelineConstants, glsl, hlsl, msl, pipeline_constants, spv};
 use naga::valid::{
     Capabilities, ModuleInfo, ShaderStages, SubgroupOperationSet, ValidationFlags, Validator,
 };
-use naga::{Module, ShaderStage};
+use naga::{EntryPoint, Module, ShaderStage};
 
 use whereabot::gpu::{Layout, kernel_text};
 
@@ -125,53 +128,155 @@ fn resolved(source: &str) -> Result<(Module, ModuleInfo), String> {
     Ok((module, info))
 }
 
-fn translate(module: &Module, info: &ModuleInfo) -> Result<(), String> {
-    let words = spv::write_vec(module, info, &spv::Options::default(), None)
-        .map_err(|e| format!("SPIR-V: {e}"))?;
-    assert!(!words.is_empty());
-    msl::write_string(
-        module,
-        info,
-        &msl::Options {
-            // The first with matrix units.
-            lang_version: (2, 3),
-            fake_missing_bindings: true,
-            ..Default::default()
-        },
-        &msl::PipelineOptions::default(),
-    )
-    .map_err(|e| format!("MSL: {e}"))?;
-    let mut text = String::new();
-    let options = hlsl::Options {
-        fake_missing_bindings: true,
-        ..Default::default()
+/// What a backend compiles.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Language {
+    SpirV,
+    Msl,
+    Hlsl,
+    Glsl,
+}
+
+use Language::{Glsl, Hlsl, Msl, SpirV};
+
+/// `entry` in `language`, as text or as SPIR-V's words.
+fn translate(
+    language: Language,
+    module: &Module,
+    info: &ModuleInfo,
+    entry: &EntryPoint,
+) -> Result<Vec<u8>, String> {
+    let text = match language {
+        SpirV => {
+            let options = spv::Options {
+                // The first with subgroups.
+                lang_version: (1, 3),
+                ..Default::default()
+            };
+            let words = spv::write_vec(module, info, &options, None).map_err(|e| e.to_string())?;
+            return Ok(words.into_iter().flat_map(u32::to_le_bytes).collect());
+        }
+        Msl => {
+            let options = msl::Options {
+                // The first with matrix units.
+                lang_version: (2, 3),
+                fake_missing_bindings: true,
+                ..Default::default()
+            };
+            let pipeline = msl::PipelineOptions::default();
+            let (text, _) =
+                msl::write_string(module, info, &options, &pipeline).map_err(|e| e.to_string())?;
+            text
+        }
+        Hlsl => {
+            let mut text = String::new();
+            let options = hlsl::Options {
+                fake_missing_bindings: true,
+                ..Default::default()
+            };
+            hlsl::Writer::new(&mut text, &options, &hlsl::PipelineOptions::default())
+                .write(module, info, None)
+                .map_err(|e| e.to_string())?;
+            text
+        }
+        Glsl => {
+            let mut text = String::new();
+            let options = glsl::Options {
+                version: glsl::Version::new_gles(310),
+                ..Default::default()
+            };
+            let pipeline = glsl::PipelineOptions {
+                shader_stage: entry.stage,
+                entry_point: entry.name.clone(),
+                multiview: None,
+            };
+            let checks = naga::proc::BoundsCheckPolicies::default();
+            glsl::Writer::new(&mut text, module, info, &options, &pipeline, checks)
+                .and_then(|mut writer| writer.write())
+                .map_err(|e| e.to_string())?;
+            text
+        }
     };
-    hlsl::Writer::new(&mut text, &options, &hlsl::PipelineOptions::default())
-        .write(module, info, None)
-        .map_err(|e| format!("HLSL: {e}"))?;
-    for entry in &module.entry_points {
-        let options = glsl::Options {
-            version: glsl::Version::new_gles(310),
-            ..Default::default()
-        };
-        let pipeline = glsl::PipelineOptions {
-            shader_stage: entry.stage,
-            entry_point: entry.name.clone(),
-            multiview: None,
-        };
-        let mut text = String::new();
-        glsl::Writer::new(
-            &mut text,
-            module,
-            info,
-            &options,
-            &pipeline,
-            naga::proc::BoundsCheckPolicies::default(),
-        )
-        .and_then(|mut writer| writer.write())
-        .map_err(|e| format!("GLSL, {}: {e}", entry.name))?;
+    Ok(text.into_bytes())
+}
+
+/// Whether naga refuses to translate: matrix units are in SPIR-V and MSL only, and other backends never
+/// list them.
+fn untranslatable(name: &str, language: Language) -> bool {
+    name.contains("cooperative") && matches!(language, Hlsl | Glsl)
+}
+
+/// Holds a translation to a compiler that runs here: Apple's and Microsoft's do not.
+///
+/// # Errors
+/// What the compiler says.
+fn compile(language: Language, entry: &EntryPoint, translated: &[u8]) -> Result<(), String> {
+    let stage = match entry.stage {
+        ShaderStage::Vertex => "vert",
+        ShaderStage::Fragment => "frag",
+        _ => "comp",
+    };
+    let hlsl = ["-D", "-V", "--target-env", "vulkan1.1", "-o", "/dev/null"];
+    let (program, package, arguments) = match language {
+        SpirV => (
+            "spirv-val",
+            "spirv-tools",
+            vec!["--target-env", "vulkan1.1", "-"],
+        ),
+        Glsl => (
+            "glslangValidator",
+            "glslang-tools",
+            vec!["--stdin", "-S", stage],
+        ),
+        Hlsl => (
+            "glslangValidator",
+            "glslang-tools",
+            [&["--stdin", "-S", stage, "-e", &entry.name], &hlsl[..]].concat(),
+        ),
+        Msl => panic!("no compiler for MSL runs here"),
+    };
+    let mut compiler = Command::new(program)
+        .args(arguments)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap_or_else(|e| {
+            panic!("{program}: {e}: install {package}, as `scripts/install --tests` does")
+        });
+    // A compiler that ends before it has read all says why.
+    let _ = compiler.stdin.take().unwrap().write_all(translated);
+    let output = compiler.wait_with_output().unwrap();
+    if output.status.success() {
+        return Ok(());
     }
-    Ok(())
+    let said = [output.stdout, output.stderr].concat();
+    Err(String::from_utf8_lossy(&said).into_owned())
+}
+
+/// Kernels that naga clears arrays in, in HLSL by a cast of 0. Microsoft's compilers have that cast,
+/// glslang has not.
+const CLEARS_ARRAYS: [&str; 7] = [
+    "conv2d_buffer",
+    "conv2d_subgroup",
+    "conv2d_subgroup_one",
+    "conv2d_texture",
+    "conv2d_tiled",
+    "dense",
+    "soft_argmax2d",
+];
+
+/// What a compiler here says to a kernel that the backends' own compilers accept.
+fn refusal(name: &str, language: Language) -> Option<&'static str> {
+    let is = |kernel: &str| name.contains(&format!("\"{kernel}\""));
+    match language {
+        Hlsl if CLEARS_ARRAYS.into_iter().any(is) => {
+            Some("array constructor needs one argument per array element")
+        }
+        // Debian 12's spirv-tools are older than SPIR-V's matrix units.
+        SpirV if is("conv2d_cooperative") => Some("Invalid capability operand: 6022"),
+        _ => None,
+    }
 }
 
 #[test]
@@ -193,14 +298,56 @@ fn every_file_is_listed() {
 fn every_kernel_translates_to_every_backend() {
     for (name, text) in compositions() {
         let (module, info) = resolved(&text).unwrap_or_else(|e| panic!("{name}: {e}"));
-        let translated = translate(&module, &info);
-        if name.contains("cooperative") {
-            // The only ones that have matrix units; other backends never list them.
-            let error = translated.unwrap_err();
-            assert!(error.starts_with("HLSL"), "{error}");
-        } else {
-            translated.unwrap_or_else(|e| panic!("{name}: {e}"));
+        for entry in &module.entry_points {
+            for language in [SpirV, Msl, Hlsl, Glsl] {
+                let translated = translate(language, &module, &info, entry);
+                assert_eq!(
+                    translated.is_err(),
+                    untranslatable(&name, language),
+                    "{name}, {language:?}: {translated:?}"
+                );
+            }
         }
+    }
+}
+
+#[test]
+fn every_translation_compiles() {
+    for (name, text) in compositions() {
+        let (module, info) = resolved(&text).unwrap();
+        for entry in &module.entry_points {
+            for language in [SpirV, Hlsl, Glsl] {
+                if untranslatable(&name, language) {
+                    continue;
+                }
+                let translated = translate(language, &module, &info, entry).unwrap();
+                let what = format!("{name}, {}, {language:?}", entry.name);
+                match (
+                    compile(language, entry, &translated),
+                    refusal(&name, language),
+                ) {
+                    (Ok(()), None) => {}
+                    (Ok(()), Some(_)) => panic!("{what}: compiles now: expect no refusal"),
+                    (Err(said), refusal) => {
+                        let known = refusal.is_some_and(|refusal| said.contains(refusal));
+                        assert!(known, "{what}: {said}");
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_wrong_translation_is_noticed() {
+    let (module, info) = resolved(&kernel_text(Some(Buffer), &[], &source("sigmoid"))).unwrap();
+    let entry = &module.entry_points[0];
+    for language in [SpirV, Hlsl, Glsl] {
+        let mut translated = translate(language, &module, &info, entry).unwrap();
+        compile(language, entry, &translated).unwrap();
+        // A word or the last brace less.
+        translated.truncate(translated.len() - 4);
+        compile(language, entry, &translated).unwrap_err();
     }
 }
 

@@ -8,7 +8,7 @@ mod gpu;
 mod report;
 mod roofline;
 mod statistics;
-mod table;
+pub(crate) mod table;
 mod timer;
 
 use image::{Rgba, RgbaImage};

@@ -66,7 +66,7 @@ pub struct Program {
 }
 
 impl Program {
-    pub(super) fn this() -> Self {
+    pub(crate) fn this() -> Self {
         Self {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             target: format!("{}-{}", std::env::consts::ARCH, std::env::consts::OS),
@@ -95,7 +95,7 @@ pub struct Adapter {
 
 impl Adapter {
     /// The adapter of `device`.
-    pub(super) fn of(device: &Device) -> Self {
+    pub(crate) fn of(device: &Device) -> Self {
         let info = device.info();
         Self {
             name: info.name.clone(),

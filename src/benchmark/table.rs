@@ -4,7 +4,7 @@ use super::report::{CascadeFigures, LayerFigures, Program, Report, Start};
 use crate::gpu::Precision;
 
 /// Columns side by side: names on the left, numbers on the right.
-pub(super) struct Table {
+pub(crate) struct Table {
     names: usize,
     rows: Vec<Vec<String>>,
 }

@@ -9,6 +9,7 @@ mod locate;
 mod photo;
 mod record;
 mod recording;
+mod verify;
 mod weights;
 
 use std::io::{self, Write};
@@ -25,6 +26,7 @@ enum Command {
     Adapters(adapters::Args),
     Info(info::Args),
     Bench(bench::Args),
+    Verify(verify::Args),
     Record(record::Args),
     Evaluate(evaluate::Args),
     #[command(subcommand)]
@@ -45,6 +47,7 @@ pub fn main() -> ExitCode {
         Command::Adapters(args) => adapters::run(&args),
         Command::Info(args) => info::run(&args),
         Command::Bench(args) => bench::run(&args),
+        Command::Verify(args) => verify::run(&args),
         Command::Record(args) => record::run(args),
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Recording(args) => recording::run(&args),

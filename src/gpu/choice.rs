@@ -46,10 +46,21 @@ impl Conv2dKernel {
 
     /// Whether `device` can run it, on the layers that it serves.
     pub fn runs_on(self, device: &Device) -> bool {
+        self.lacks(device).is_none()
+    }
+
+    /// What `device` lacks to run it; `None` where it can.
+    pub fn lacks(self, device: &Device) -> Option<String> {
         match self {
-            Self::SubgroupOne | Self::Subgroup => device.subgroup_size().is_some_and(|n| n >= 8),
-            Self::Cooperative => device.tier() == Tier::CooperativeMatrix,
-            Self::Texture | Self::Tiled(_) | Self::Buffer => true,
+            Self::SubgroupOne | Self::Subgroup => match device.subgroup_size() {
+                Some(8..) => None,
+                Some(size) => Some(format!("subgroups of {size}, 8 needed")),
+                None => Some("no subgroups, 8 needed".into()),
+            },
+            Self::Cooperative if device.tier() < Tier::CooperativeMatrix => {
+                Some("no matrix units for 16 x 16 halves".into())
+            }
+            Self::Cooperative | Self::Texture | Self::Tiled(_) | Self::Buffer => None,
         }
     }
 

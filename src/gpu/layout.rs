@@ -24,7 +24,8 @@ impl fmt::Display for Precision {
 
 /// How the tensors of a plan lie in memory: one way for all of them, so that nothing is converted
 /// between layers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Layout {
     /// A buffer of `[channel / 4][image][row][column]` of `vec4<f32>`.
     Buffer,
@@ -40,6 +41,14 @@ impl Layout {
     /// Every layout.
     pub const ALL: [Self; 3] = [Self::Buffer, Self::HalfBuffer, Self::Texture];
 
+    /// What it stores.
+    pub fn precision(self) -> Precision {
+        match self {
+            Self::HalfBuffer => Precision::F16,
+            Self::Buffer | Self::Texture => Precision::F32,
+        }
+    }
+
     /// What suits an adapter for 32-bit floats. CPU rasterisers read storage textures several times faster than
     /// buffers; GPUs want buffers.
     pub(super) fn of(info: &wgpu::AdapterInfo) -> Self {
@@ -48,6 +57,16 @@ impl Layout {
         } else {
             Self::Buffer
         }
+    }
+}
+
+impl fmt::Display for Layout {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Self::Buffer => "buffer",
+            Self::HalfBuffer => "half_buffer",
+            Self::Texture => "texture",
+        })
     }
 }
 

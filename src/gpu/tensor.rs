@@ -101,8 +101,8 @@ impl Tensor {
         })
     }
 
-    /// `channels` channels from channel `first` on, a multiple of four; `None` where a buffer cannot
-    /// be bound from there on.
+    /// `channels` channels from channel `first` on, a multiple of four; `None` where memory cannot be
+    /// bound from there on.
     pub(super) fn slice(&self, device: &Device, first: usize, channels: usize) -> Option<Self> {
         let shape = Shape {
             channels,
@@ -137,6 +137,10 @@ impl Tensor {
                 ..
             } => {
                 let first_layer = first_layer + first_plane as u32;
+                // wgpu's GL backend binds a texture from its first layer on, whatever its view says.
+                if first_layer > 0 && device.info().backend == wgpu::Backend::Gl {
+                    return None;
+                }
                 Memory::Texture {
                     view: layers(texture, first_layer, planes as u32),
                     texture: texture.clone(),

@@ -36,12 +36,14 @@ pub const ORIENTATIONS: [Orientation; 8] = [
     Orientation::Rotate270FlipH,
 ];
 
-/// How often a property is tried. Failures print their case; they are kept as tests by hand.
+/// How often a property is tried, at most as often as `PROPTEST_CASES` says. Failures print their case; they
+/// are kept as tests by hand.
 pub fn cases(count: u32) -> proptest::test_runner::Config {
+    let default = proptest::test_runner::Config::default();
     proptest::test_runner::Config {
-        cases: count,
+        cases: count.min(default.cases),
         failure_persistence: None,
-        ..Default::default()
+        ..default
     }
 }
 
@@ -54,6 +56,30 @@ pub fn device() -> Arc<Device> {
             .expect("an adapter is needed: install mesa-vulkan-drivers");
         Arc::new(device)
     }))
+}
+
+/// A driver that `scripts/drivers` runs tests on, each with differences that `tests/drivers.rs` expects.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Driver {
+    /// Mesa's Vulkan on the CPU.
+    Lavapipe,
+    /// Google's Vulkan on the CPU, which comes with Chromium.
+    SwiftShader,
+    /// wgpu's GL backend, on Mesa's GL on the CPU.
+    Gl,
+}
+
+/// That of [`device`]; `None` for others.
+pub fn driver() -> Option<Driver> {
+    let device = device();
+    let info = device.info();
+    let mesa = info.name.starts_with("llvmpipe");
+    match info.backend {
+        wgpu::Backend::Vulkan if mesa => Some(Driver::Lavapipe),
+        wgpu::Backend::Vulkan if info.name.starts_with("SwiftShader") => Some(Driver::SwiftShader),
+        wgpu::Backend::Gl if mesa => Some(Driver::Gl),
+        _ => None,
+    }
 }
 
 /// Values in [-1, 1), the same for the same seed.
