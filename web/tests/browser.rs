@@ -362,11 +362,17 @@ fn the_page_works_on_a_phone_without_webgpu() {
     bench
         .page
         .run("document.querySelector('[value=ur5]').click()");
-    bench.page.run("document.getElementById('camera').click()");
+    let mirrored = "return document.getElementById('view').className === 'mirrored'";
+    assert_eq!(bench.page.run(mirrored), false);
+    bench.page.run(
+        "MediaStreamTrack.prototype.getSettings = () => ({ facingMode: 'user' });
+         document.getElementById('camera').click()",
+    );
     bench.wait_for("status", "UR5 found");
     bench
         .page
         .wait_until("Number(document.getElementById('rate').innerText) > 0");
+    assert_eq!(bench.page.run(mirrored), true);
     bench.page.run("document.getElementById('pause').click()");
 
     let permissions = json!({"permissions": ["clipboardReadWrite", "clipboardSanitizedWrite"]});
