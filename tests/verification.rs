@@ -13,7 +13,7 @@ use common::device;
 use known::{XYZ, command, model};
 use serde_json::{Value, json};
 use tempfile::TempDir;
-use whereabot::benchmark::Weights;
+use whereabot::benchmark::{Adapter, Weights};
 use whereabot::gpu::{AdapterRequest, Device, Precision};
 use whereabot::network::Model;
 use whereabot::verification::{Outcome, Report, Verdict, verify};
@@ -31,7 +31,8 @@ fn report(device: &Device) -> (Report, Vec<(usize, usize)>) {
     let mut told = Vec::new();
     let mut progress = |done, count, _: &str| told.push((done, count));
     let both = [Precision::F32, Precision::F16];
-    let report = verify(device, &model, weights, &both, &mut progress);
+    let adapter = Adapter::of(device);
+    let report = verify(device, adapter, &model, weights, &both, &mut progress);
     let report = pollster::block_on(report);
     (report, told)
 }

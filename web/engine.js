@@ -4,6 +4,7 @@
 //   locate(picture, width, height, hfov)   searches an ImageBitmap or a <video>: see src/answer.rs
 //   probabilities()                        the last mask at the network's size, a Float32Array
 //   benchmark(progress)                    the JSON of the benchmark
+//   verify(progress)                       the JSON of `whereabot verify`; the GPU alone has it
 import init, { Gpu } from './whereabot_web.js';
 
 class OnGpu {
@@ -28,6 +29,10 @@ class OnGpu {
 
   benchmark(progress) {
     return this.gpu.benchmark(progress);
+  }
+
+  verify(progress) {
+    return this.gpu.verify(progress);
   }
 }
 

@@ -270,10 +270,28 @@ async function measure() {
   }
 }
 
-async function copy() {
-  await navigator.clipboard.writeText(report);
-  $('copy').textContent = 'Copied';
-  setTimeout(() => ($('copy').textContent = 'Copy JSON'), 1500);
+async function copy(button, text) {
+  const name = button.textContent;
+  await navigator.clipboard.writeText(text);
+  button.textContent = 'Copied';
+  setTimeout(() => (button.textContent = name), 1500);
+}
+
+// --- verification
+
+async function verify() {
+  $('verify').disabled = true;
+  $('verdict').textContent = 'waiting';
+  try {
+    const json = await inTurn(() => engine.verify((text) => ($('verdict').textContent = `comparing: ${text}`)));
+    $('verdict').textContent = JSON.parse(json).line;
+    $('copy-line').hidden = false;
+  } catch (error) {
+    $('verdict').textContent = '';
+    throw error;
+  } finally {
+    $('verify').disabled = false;
+  }
 }
 
 // --- what people do
@@ -302,7 +320,9 @@ on('hfov', 'input', () => {
   return refresh();
 });
 on('measure', 'click', measure);
-on('copy', 'click', copy);
+on('copy', 'click', ({ target }) => copy(target, report));
+on('verify', 'click', verify);
+on('copy-line', 'click', ({ target }) => copy(target, $('verdict').textContent));
 
 for (const event of ['dragover', 'dragleave', 'drop']) {
   $('view').addEventListener(event, (happened) => {
@@ -322,6 +342,7 @@ attempt(async () => {
   await loadRobot();
   document.querySelector('.stage').inert = false;
   $('measure').disabled = false;
+  $('verification').hidden = !engine.verify;
   await useSample();
   if (opened.why) complain(`${opened.why}: the networks run in plain Rust on one core of this device.`);
 });

@@ -95,7 +95,7 @@ pub struct Adapter {
 
 impl Adapter {
     /// The adapter of `device`.
-    pub(crate) fn of(device: &Device) -> Self {
+    pub fn of(device: &Device) -> Self {
         let info = device.info();
         Self {
             name: info.name.clone(),

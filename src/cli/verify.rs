@@ -12,7 +12,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::engine::{self, PrecisionName};
 use super::weights;
-use crate::benchmark::Weights;
+use crate::benchmark::{Adapter, Weights};
 use crate::gpu::{GpuError, Precision};
 use crate::network::Model;
 use crate::verification::{self, Verdict};
@@ -64,8 +64,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         bar.set_message(what.to_owned());
     };
     let named = Weights::new(&model, &bytes);
-    let report = verification::verify(&device, &model, named, &precisions, &mut progress);
-    let report = pollster::block_on(report);
+    let report = pollster::block_on(verification::verify(
+        &device,
+        Adapter::of(&device),
+        &model,
+        named,
+        &precisions,
+        &mut progress,
+    ));
     bar.finish_and_clear();
     engine::remember(&device);
 

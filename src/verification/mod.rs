@@ -25,12 +25,13 @@ const CASES: usize = 3;
 /// the next one is of.
 pub type Progress<'a> = &'a mut dyn FnMut(usize, usize, &str);
 
-/// Holds `device` to the reference, with what it stores in `precisions`, and runs `model`, whose `weights`
-/// the report names. Whatever goes wrong is in the report.
+/// Holds `device` to the reference, with what it stores in `precisions`, and runs `model`. The report names
+/// `adapter`, the device's, and the `weights`. Whatever goes wrong is in the report.
 ///
 /// In a browser the checks await it; elsewhere they block.
 pub async fn verify(
     device: &Device,
+    adapter: Adapter,
     model: &Model,
     weights: Weights,
     precisions: &[Precision],
@@ -66,7 +67,7 @@ pub async fn verify(
         );
         checks.extend(cascade(device, model, precision).await);
     }
-    Report::new(Program::this(), Adapter::of(device), weights, checks)
+    Report::new(Program::this(), adapter, weights, checks)
 }
 
 async fn compare(

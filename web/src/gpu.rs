@@ -2,11 +2,12 @@ use std::sync::Arc;
 
 use wasm_bindgen::prelude::*;
 use web_sys::{HtmlCanvasElement, HtmlVideoElement, ImageBitmap};
-use whereabot::benchmark::{self, Options, Weights};
+use whereabot::benchmark::{self, Adapter, Options, Weights};
 use whereabot::camera::Camera;
 use whereabot::cascade::{HostLocator, HostOptions, MaskSize, Source};
-use whereabot::gpu::{AdapterRequest, Device};
+use whereabot::gpu::{AdapterRequest, Device, Precision};
 use whereabot::network::Model;
+use whereabot::verification;
 
 use crate::screen::Screen;
 use crate::{answer, progress};
@@ -117,6 +118,28 @@ impl Gpu {
         let mut report = report.await?;
         report.adapter.name.clone_from(&self.adapter);
         Ok(serde_json::to_string_pretty(&report)?)
+    }
+
+    /// Holds the browser's GPU to plain Rust, tells `script` what is being compared, and gives the report's JSON.
+    pub async fn verify(&self, script: js_sys::Function) -> Result<String, JsError> {
+        let finder = self.finder.as_ref().ok_or_else(not_loaded)?;
+        let adapter = Adapter {
+            name: self.adapter.clone(),
+            ..Adapter::of(&self.device)
+        };
+        let mut tell = progress(&script);
+        let mut tell = |done: usize, all: usize, what: &str| {
+            tell(&format!("{} of {all}, {what}", done + 1));
+        };
+        let report = verification::verify(
+            &self.device,
+            adapter,
+            &finder.model,
+            finder.weights.clone(),
+            &[Precision::F32, Precision::F16],
+            &mut tell,
+        );
+        Ok(serde_json::to_string_pretty(&report.await)?)
     }
 
     /// Copies `picture` to a texture, which is made anew only for another size.

@@ -30,7 +30,7 @@ pub fn assumed_hfov(width: u32, height: u32) -> f64 {
         .to_degrees()
 }
 
-/// Tells `script` what is being measured.
+/// Tells `script` what is being done.
 fn progress(script: &js_sys::Function) -> impl FnMut(&str) {
     move |what| {
         // Whether a page shows it is the page's own affair.

@@ -280,6 +280,19 @@ fn a_benchmark_on_the_gpu_is_one_that_the_program_reads() {
 }
 
 #[test]
+fn the_browser_s_gpu_is_held_to_plain_rust() {
+    let mut bench = Bench::open();
+    bench.go_with_engine("gpu", &small(&weights("ur5")));
+    let json = bench.page.run("return await engine.verify(() => {})");
+    let report: Value = serde_json::from_str(json.as_str().unwrap()).unwrap();
+    let line = report["line"].as_str().unwrap();
+    assert!(line.contains(" agrees on google swiftshader"), "{line}");
+    let checks = report["checks"].as_array().unwrap();
+    let agree = checks.iter().filter(|check| check["outcome"] == "agrees");
+    assert!(agree.count() > 30, "{line}");
+}
+
+#[test]
 fn the_page_on_the_gpu_shows_what_was_found() {
     let mut bench = Bench::open();
     bench.page.resize(1280, 800, 1, "light");
