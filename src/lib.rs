@@ -10,6 +10,8 @@ pub mod draw;
 #[cfg(feature = "recording")]
 pub mod evaluation;
 pub mod gpu;
+#[cfg(feature = "live")]
+pub mod live;
 pub mod network;
 #[cfg(feature = "recording")]
 pub mod recording;
