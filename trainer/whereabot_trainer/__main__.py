@@ -113,7 +113,8 @@ def main(argv=None):
     command.add_argument("--pool", type=int, default=4, metavar="P", help="size of both max-pools (%(default)s)")
     command.add_argument("--overlay", choices=("threshold", "multiply"), default="threshold",
                          help="colour where the mask is at least 0.5, or colour times mask (%(default)s)")
-    command.add_argument("--mask-run", metavar="RUN", help="finished run of train-mask, to validate the full system")
+    command.add_argument("--mask-run", metavar="RUN", help="finished run of train-mask, or a model file, whose masks"
+                         " the full system is validated with")
     command.add_argument("--estimated-masks", type=float, default=0.0, metavar="SHARE",
                          help="share of training samples with the mask run's masks for the true ones (%(default)s)")
     command.add_argument("--estimated-after", type=float, default=0.0, metavar="PROGRESS",
@@ -123,8 +124,8 @@ def main(argv=None):
     command.set_defaults(run=_run(train.train_joint))
 
     command = commands.add_parser("export", help="write both networks as a model file")
-    command.add_argument("--mask", required=True, metavar="RUN")
-    command.add_argument("--joint", required=True, metavar="RUN")
+    command.add_argument("--mask", required=True, metavar="RUN", help="run of train-mask, or a model file whose mask network stays")
+    command.add_argument("--joint", required=True, metavar="RUN", help="run of train-joint")
     source = command.add_mutually_exclusive_group(required=True)
     source.add_argument("--validation", nargs="+", metavar="DIR",
                         help="recordings to choose the presence threshold and measure the figures on")
