@@ -93,7 +93,9 @@ def main(argv=None):
     _training_flags(command, minutes=40, batch=8, learning_rate=(4e-3, 2e-5), momentum=(0.95, 0.95),
                     dilations=(1, 3, 9, 27, 1))
     command.add_argument("--family", choices=("paper", "context"), default="paper",
-                         help="the paper's network, or a wider one with skips that has no --dilations (%(default)s)")
+                         help="the paper's network, or a wider one with skips that has no --dilations and no --kernel (%(default)s)")
+    command.add_argument("--kernel", type=int, default=3, metavar="K",
+                         help="columns and rows of the paper's network's convolutions (%(default)s)")
     command.add_argument("--crop", nargs=2, type=int, default=(160, 128), metavar=("W", "H"),
                          help="pixels of a training crop (%(default)s)")
     command.add_argument("--zoom", nargs=2, type=float, default=(0.7, 1.6), metavar=("LEAST", "MOST"),

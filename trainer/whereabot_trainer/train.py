@@ -286,7 +286,7 @@ def train_mask(args):
     height, width = args.crop[1], args.crop[0]
     card |= {"family": args.family, "foreground_share": share, "w_fg": w_fg, "w_bg": w_bg,
              "crop": args.crop, "camera": args.camera, **({"zoom": args.zoom} if args.camera == "free" else {})}
-    layers = context_mask_layers() if args.family == "context" else paper_mask_layers(args.dilations)
+    layers = context_mask_layers() if args.family == "context" else paper_mask_layers(args.dilations, args.kernel)
     network = initialise(Network(layers, MASK_INPUT, normalise=args.normalise))
     if args.init_from:
         start_from(network, starting_tensors(args.init_from, "mask")[0], samples.pixels(numbers[:: len(numbers) // 64 + 1])[0])
