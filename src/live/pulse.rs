@@ -1,3 +1,4 @@
+use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use super::Rates;
@@ -7,8 +8,8 @@ use super::Rates;
 pub(super) struct Pulse {
     state: State,
     last: Option<Instant>,
-    /// Between frames.
-    period: Option<Duration>,
+    /// Between the last frames, the oldest first.
+    intervals: VecDeque<Duration>,
     frames: u32,
     ages: Vec<Duration>,
 }
@@ -25,7 +26,9 @@ enum State {
 impl Pulse {
     /// What a frame may be late, besides two periods.
     const GRACE: Duration = Duration::from_millis(100);
-    /// The period until two frames have come.
+    /// How many intervals tell the period.
+    const INTERVALS: usize = 16;
+    /// The period, at least, until half as many are known: some streams begin with frames that were kept.
     const PERIOD: Duration = Duration::from_millis(500);
 
     /// A frame came: whether the camera is live from now on.
@@ -33,18 +36,28 @@ impl Pulse {
         self.frames += 1;
         let was = std::mem::replace(&mut self.state, State::Live);
         let last = self.last.replace(at);
-        if was == State::Live
-            && let Some(last) = last
-        {
-            let took = at.saturating_duration_since(last);
-            // Follows longer waits soon and shorter ones late: some streams begin with frames that were kept.
-            self.period = Some(match self.period {
-                Some(period) if took < period => period - (period - took) / 16,
-                Some(period) => period + (took - period) / 2,
-                None => took,
-            });
+        match last {
+            Some(last) if was != State::Silent => {
+                if self.intervals.len() == Self::INTERVALS {
+                    self.intervals.pop_front();
+                }
+                self.intervals.push_back(at.saturating_duration_since(last));
+            }
+            _ => self.intervals.clear(),
         }
         was != State::Live
+    }
+
+    /// Between frames: what three of four intervals do not exceed, so that neither a pause nor a burst counts.
+    fn period(&self) -> Duration {
+        let mut sorted: Vec<Duration> = self.intervals.iter().copied().collect();
+        sorted.sort_unstable();
+        let period = percentile(&sorted, 75).unwrap_or_default();
+        if sorted.len() < Self::INTERVALS / 2 {
+            period.max(Self::PERIOD)
+        } else {
+            period
+        }
     }
 
     /// The source failed or ended.
@@ -60,7 +73,7 @@ impl Pulse {
     /// Until when the next frame must come; `None` where none is expected.
     pub fn deadline(&self) -> Option<Instant> {
         let last = self.last.filter(|_| self.state == State::Live)?;
-        Some(last + 2 * self.period.unwrap_or(Self::PERIOD) + Self::GRACE)
+        Some(last + 2 * self.period() + Self::GRACE)
     }
 
     /// Whether the camera is stale from now on.
@@ -120,6 +133,23 @@ mod tests {
         // The pause is no period.
         assert!(pulse.arrived(last + 100 * TICK));
         assert_eq!(pulse.deadline(), Some(last + 102 * TICK + Pulse::GRACE));
+    }
+
+    #[test]
+    fn a_burst_at_the_beginning_is_no_pace() {
+        let start = Instant::now();
+        let mut pulse = Pulse::default();
+        let slow = 5 * TICK;
+        for _ in 0..4 {
+            pulse.arrived(start);
+        }
+        for frame in 1..20 {
+            let at = start + frame * slow;
+            assert!(!pulse.is_overdue(at), "{frame}");
+            pulse.arrived(at);
+        }
+        let last = start + 19 * slow;
+        assert_eq!(pulse.deadline(), Some(last + 2 * slow + Pulse::GRACE));
     }
 
     #[test]

@@ -52,6 +52,7 @@ impl Reader {
         loop {
             match self.frame(stream.as_mut(), memory) {
                 Ok(Some(frame)) => {
+                    patience.frame_came();
                     // Before the frame itself: whoever sees its answer knows that the camera lives.
                     self.tell(Message::Arrived {
                         camera: self.camera,
@@ -145,33 +146,27 @@ impl Reader {
     }
 }
 
-/// How long to wait before the next try: twice as long each time, unless all was well in between.
+/// How long to wait before the next try: twice as long each time, unless frames came for longer in between.
+#[derive(Default)]
 struct Patience {
     wait: Duration,
-    failed: Instant,
-}
-
-impl Default for Patience {
-    fn default() -> Self {
-        Self {
-            wait: Self::LEAST / 2,
-            failed: Instant::now(),
-        }
-    }
+    /// The first frame since the last failure.
+    first: Option<Instant>,
 }
 
 impl Patience {
     const LEAST: Duration = Duration::from_millis(250);
     const MOST: Duration = Duration::from_secs(10);
 
+    fn frame_came(&mut self) {
+        self.first.get_or_insert_with(Instant::now);
+    }
+
     fn next(&mut self) -> Duration {
-        let well = self.failed.elapsed().saturating_sub(self.wait);
-        self.wait = if well > 2 * self.wait {
-            Self::LEAST
-        } else {
-            (2 * self.wait).clamp(Self::LEAST, Self::MOST)
-        };
-        self.failed = Instant::now();
+        let first = self.first.take();
+        let well = first.is_some_and(|first| first.elapsed() > 2 * self.wait);
+        let wait = if well { Duration::ZERO } else { 2 * self.wait };
+        self.wait = wait.clamp(Self::LEAST, Self::MOST);
         self.wait
     }
 }
