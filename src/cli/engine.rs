@@ -65,15 +65,21 @@ pub(super) fn locator(
     precision: Precision,
 ) -> anyhow::Result<Locator> {
     let Some(device) = device else {
-        ensure!(
-            precision == Precision::F32,
-            "plain Rust computes in f32 only"
-        );
+        ensure_f32(precision)?;
         return Ok(Locator::on_cpu(model));
     };
     let locator = Locator::on_gpu(Arc::clone(device), model, precision)?;
     remember(device);
     Ok(locator)
+}
+
+/// Whether plain Rust can compute in `precision`.
+pub(super) fn ensure_f32(precision: Precision) -> anyhow::Result<()> {
+    ensure!(
+        precision == Precision::F32,
+        "plain Rust computes in f32 only"
+    );
+    Ok(())
 }
 
 /// Keeps what was found about an adapter and what its driver compiled, if there is anything new.

@@ -15,7 +15,7 @@ use super::engine::{self, PrecisionName};
 use super::photo::{self, Photo};
 use super::weights;
 use crate::camera::{Camera, Intrinsics};
-use crate::cascade::{Estimate, Joint, Locator, Output, Status};
+use crate::cascade::{Estimate, EstimateLine, Joint, Locator, Output, Status, rounded};
 use crate::draw;
 use crate::gpu::{Device, Precision};
 use crate::network::Model;
@@ -63,7 +63,7 @@ pub struct Args {
     engine: engine::EngineArgs,
 }
 
-fn field_of_view(text: &str) -> Result<f64, String> {
+pub(super) fn field_of_view(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(degrees) if degrees > 0.0 && degrees < 180.0 => Ok(degrees),
         _ => Err("expected degrees between 0 and 180".to_owned()),
@@ -345,14 +345,8 @@ struct LocatedLine<'a> {
     schema: u32,
     file: &'a str,
     robot: &'a str,
-    status: &'static str,
-    coverage: f64,
-    field: f64,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    bbox_px: Option<[f64; 4]>,
-    frame: &'static str,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    joints: Option<Vec<JointLine<'a>>>,
+    #[serde(flatten)]
+    estimate: EstimateLine<'a>,
     intrinsics: IntrinsicsLine,
     adapter: &'a str,
     ms: Times,
@@ -360,13 +354,6 @@ struct LocatedLine<'a> {
     mask: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
     annotated: Option<String>,
-}
-
-#[derive(Serialize)]
-struct JointLine<'a> {
-    name: &'a str,
-    xyz_m: [f64; 3],
-    px: [f64; 2],
 }
 
 #[derive(Serialize)]
@@ -395,29 +382,14 @@ impl Located {
         }
     }
 
-    fn status(&self) -> &'static str {
-        match self.estimate.status {
-            Status::Found => "found",
-            Status::NotFound => "not_found",
-            Status::Invalid => "invalid",
-        }
-    }
-
     fn json(&self) -> anyhow::Result<String> {
-        let estimate = &self.estimate;
         let Intrinsics { fx, fy, cx, cy } = self.camera.intrinsics;
         let path = |path: &Path| path.display().to_string();
         let line = LocatedLine {
             schema: SCHEMA,
             file: &self.file,
             robot: &self.robot,
-            status: self.status(),
-            coverage: rounded(estimate.coverage, 6),
-            field: rounded(estimate.field, 4),
-            bbox_px: estimate.bbox_px.map(|bbox| bbox.map(|v| rounded(v, 2))),
-            frame: "camera_optical",
-            joints: (!estimate.joints.is_empty())
-                .then(|| estimate.joints.iter().map(JointLine::from).collect()),
+            estimate: EstimateLine::from(&self.estimate),
             intrinsics: IntrinsicsLine {
                 fx: rounded(fx, 3),
                 fy: rounded(fy, 3),
@@ -469,16 +441,6 @@ impl Located {
     }
 }
 
-impl<'a> From<&'a Joint> for JointLine<'a> {
-    fn from(joint: &'a Joint) -> Self {
-        Self {
-            name: &joint.name,
-            xyz_m: joint.xyz_m.map(|v| rounded(v, 5)),
-            px: joint.px.map(|v| rounded(v, 2)),
-        }
-    }
-}
-
 fn error_line(path: &Path, error: &anyhow::Error) -> anyhow::Result<String> {
     Ok(serde_json::to_string(&ErrorLine {
         schema: SCHEMA,
@@ -486,10 +448,4 @@ fn error_line(path: &Path, error: &anyhow::Error) -> anyhow::Result<String> {
         status: "error",
         message: &format!("{error:#}"),
     })?)
-}
-
-/// To `digits` behind the point: no more than an estimate is worth.
-fn rounded(value: f64, digits: i32) -> f64 {
-    let scale = 10_f64.powi(digits);
-    (value * scale).round() / scale
 }

@@ -10,6 +10,7 @@ mod photo;
 mod record;
 mod recording;
 mod verify;
+mod watch;
 mod weights;
 
 use std::io::{self, Write};
@@ -23,6 +24,7 @@ use crate::gpu::GpuError;
 #[command(version, about)]
 enum Command {
     Locate(locate::Args),
+    Watch(watch::Args),
     Adapters(adapters::Args),
     Info(info::Args),
     Bench(bench::Args),
@@ -44,6 +46,7 @@ pub fn main() -> ExitCode {
         .init();
     let done = match Command::parse() {
         Command::Locate(args) => locate::run(args),
+        Command::Watch(args) => watch::run(args),
         Command::Adapters(args) => adapters::run(&args),
         Command::Info(args) => info::run(&args),
         Command::Bench(args) => bench::run(&args),

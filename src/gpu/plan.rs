@@ -146,6 +146,33 @@ impl Plan {
         slot.bind(device, &self.image, planes, &params)
     }
 
+    /// Writes `image` to be image `index` of the next submission, whose dispatches `source`'s goes in front of; and
+    /// how it becomes the canonical image. For those who have more sources than images a frame.
+    ///
+    /// # Errors
+    /// An image beyond the adapter's limits, too little memory.
+    #[cfg(not(target_arch = "wasm32"))]
+    pub(crate) fn write_source(
+        &self,
+        device: &Device,
+        source: &mut Rectify,
+        index: usize,
+        image: &RgbaImage,
+        rectification: &Rectification,
+    ) -> Result<(), GpuError> {
+        let params = Rectification {
+            index: index as u32,
+            ..*rectification
+        };
+        source.write(device, &self.image, image, &params)
+    }
+
+    /// Images a frame.
+    #[cfg(not(target_arch = "wasm32"))]
+    pub(crate) fn batch(&self) -> usize {
+        self.image.batch
+    }
+
     /// The mask network's output: probabilities `[1, height, width]`.
     pub fn mask(&self) -> &Tensor {
         self.mask.output()
@@ -214,7 +241,7 @@ impl Plan {
         self.dispatch(encoder, self.steps(with_joints), timestamps);
         self.copy_results(encoder, &self.results);
         if with_mask {
-            self.mask.output().copy_to(encoder, &self.masks, 0);
+            self.copy_masks(encoder, &self.masks);
         }
     }
 
@@ -247,6 +274,26 @@ impl Plan {
         let (after_joints, totals) = (joints.staging_size(), self.totals.size());
         joints.copy_to(encoder, results, 0);
         encoder.copy_buffer_to_buffer(&self.totals, 0, results, after_joints, totals);
+    }
+
+    /// A buffer for [`Self::copy_masks`], to be mapped.
+    #[cfg(not(target_arch = "wasm32"))]
+    pub(crate) fn masks_buffer(&self, device: &Device) -> wgpu::Buffer {
+        staging_buffer(device, self.mask.output().staging_size())
+    }
+
+    /// Records the copy of a frame's masks, for [`Self::put_masks`].
+    pub(crate) fn copy_masks(&self, encoder: &mut wgpu::CommandEncoder, masks: &wgpu::Buffer) {
+        self.mask.output().copy_to(encoder, masks, 0);
+    }
+
+    /// Puts what [`Self::copy_masks`] copied into `frames`.
+    pub(crate) fn put_masks(&self, frames: &mut [Frame], bytes: &[u8]) {
+        let values = self.mask.output().values(bytes);
+        let plane = self.image.shape.height * self.image.shape.width;
+        for (frame, mask) in frames.iter_mut().zip(values.chunks_exact(plane)) {
+            frame.mask = mask.to_vec();
+        }
     }
 
     /// What [`Self::copy_results`] copied: each image's, without masks.
@@ -282,12 +329,8 @@ impl Plan {
             frames.iter_mut().for_each(|frame| frame.joints.clear());
         }
         if with_mask {
-            let values = device.read_async(&self.masks, |bytes| self.mask.output().values(bytes));
-            let values = values.await?;
-            let plane = self.image.shape.height * self.image.shape.width;
-            for (frame, mask) in frames.iter_mut().zip(values.chunks_exact(plane)) {
-                frame.mask = mask.to_vec();
-            }
+            let masks = device.read_async(&self.masks, |bytes| self.put_masks(&mut frames, bytes));
+            masks.await?;
         }
         Ok(frames)
     }

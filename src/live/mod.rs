@@ -4,6 +4,28 @@
 //! replaces it; the scheduler takes what is fresh from all mailboxes into one submission; what was found
 //! goes to every [`Sink`] as an [`Observation`].
 
+mod config;
+mod engine;
+mod frame;
+mod input;
+mod lines;
+mod mailbox;
+mod message;
 mod observation;
+mod pulse;
+mod reader;
+mod scheduler;
+mod service;
+mod source;
+mod stop;
+mod watch;
 
+pub use config::{CameraConfig, Config, ConfigError};
+pub use engine::{CpuEngine, Engine, GpuEngine, GpuOptions, IN_FLIGHT, OpenDevice};
+pub use frame::Frame;
+pub use input::{Calibration, Input};
+pub use lines::{Lines, Named};
 pub use observation::{Event, EventKind, Observation, Rates, Sink, Statistics};
+pub use source::{Location, Shot, Source, SourceError, Stream};
+pub use stop::Stop;
+pub use watch::watch;

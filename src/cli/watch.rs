@@ -1,0 +1,214 @@
+//! `whereabot watch`: finds the robots in the frames of many cameras, live.
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::Duration;
+
+use anyhow::{Context, ensure};
+use signal_hook::consts::{SIGINT, SIGTERM};
+
+use super::engine::{self, PrecisionName};
+use super::locate::field_of_view;
+use super::weights;
+use crate::camera::Camera;
+use crate::gpu::{Device, GpuError};
+use crate::live::{
+    Calibration, CameraConfig, Config, CpuEngine, Engine, GpuEngine, GpuOptions, Lines, Location,
+    Named, Sink, Stop, watch,
+};
+use crate::network::Model;
+
+/// Find the robots in the frames of many cameras, live
+///
+/// Writes JSON Lines: a result a camera a frame, events (a camera is live, stale, failed, ended; the GPU is lost, back),
+/// and once a second statistics. Always the newest frame of each camera is searched; older ones are dropped and
+/// counted. A camera that fails is opened again and delays no other. Stops with Ctrl-C, SIGTERM, or when all
+/// sources came to their end. Videos, streams and webcams are read by ffmpeg (5.1 or newer), which must be on the
+/// PATH. Exits with 0; with 1 if it could not start; with 2 on wrong usage.
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// The cameras (see the README)
+    #[arg(value_name = "CAMERAS.TOML", required_unless_present = "source")]
+    config: Option<PathBuf>,
+    /// A camera without a file, may be given several times: a webcam's number, a stream's address, a video, a folder
+    /// of images, a recording
+    #[arg(long, value_name = "SOURCE", conflicts_with = "config")]
+    source: Vec<String>,
+    /// With --source: the robot to find [default: ur5]
+    #[arg(long, value_name = "NAME", value_parser = weights::robot_name, conflicts_with = "config")]
+    robot: Option<String>,
+    /// With --source: the model file to use
+    #[arg(long, value_name = "FILE", conflicts_with = "config")]
+    weights: Option<PathBuf>,
+    /// With --source: the cameras' ROS camera_info (YAML); by default a phone's camera is assumed
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["hfov", "config"])]
+    camera: Option<PathBuf>,
+    /// With --source: the cameras' horizontal field of view
+    #[arg(long, value_name = "DEGREES", value_parser = field_of_view, conflicts_with = "config")]
+    hfov: Option<f64>,
+    /// What to store activations in; f16 is for GPUs
+    #[arg(long, value_enum, value_name = "NAME", default_value = "f32")]
+    precision: PrecisionName,
+    #[command(flatten)]
+    engine: engine::EngineArgs,
+}
+
+/// Runs the command.
+pub fn run(args: Args) -> anyhow::Result<ExitCode> {
+    let mut models = Models::default();
+    let cameras = cameras(&args, &mut models)?;
+    for camera in &cameras {
+        let name = || format!("camera `{}`", camera.name);
+        camera.location.check().with_context(name)?;
+        if camera.calibration == Calibration::Assumed
+            && !matches!(camera.location, Location::Recording(_))
+        {
+            log::warn!(
+                "{}: no camera_info and no hfov: a phone's main camera is assumed",
+                name()
+            );
+        }
+    }
+    let stop = Arc::new(Stop::default());
+    let sinks = sinks(&cameras, &models, &stop);
+    let mask = sinks.iter().any(|sink| sink.wants_masks());
+    let engine = engine(args, models, cameras.len(), mask)?;
+    stop_on_signals(&stop).context("signals cannot be handled")?;
+    let inputs = cameras.iter().map(CameraConfig::input).collect();
+    watch(inputs, engine, sinks, &stop);
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Sets `stop` on Ctrl-C and SIGTERM.
+fn stop_on_signals(stop: &Arc<Stop>) -> io::Result<()> {
+    let signalled = Arc::new(AtomicBool::new(false));
+    for signal in [SIGINT, SIGTERM] {
+        signal_hook::flag::register(signal, Arc::clone(&signalled))?;
+    }
+    let stop = Arc::clone(stop);
+    // A handler may do little more than set a flag.
+    thread::spawn(move || {
+        while !stop.wait(Duration::from_millis(20)) {
+            if signalled.load(Ordering::Relaxed) {
+                stop.set();
+            }
+        }
+    });
+    Ok(())
+}
+
+/// Where results go.
+fn sinks(cameras: &[CameraConfig], models: &Models, stop: &Arc<Stop>) -> Vec<Box<dyn Sink>> {
+    let named = cameras.iter().map(|camera| Named {
+        camera: camera.name.clone(),
+        robot: models.robot(camera.robot).to_owned(),
+    });
+    let closed = Arc::clone(stop);
+    let lines = Lines::new(named.collect(), io::stdout(), move |error| {
+        if error.kind() != io::ErrorKind::BrokenPipe {
+            log::error!("stdout: {error}");
+        }
+        // The reader, such as `head`, has what it wanted.
+        closed.set();
+    });
+    vec![Box::new(lines)]
+}
+
+fn cameras(args: &Args, models: &mut Models) -> anyhow::Result<Vec<CameraConfig>> {
+    if let Some(file) = &args.config {
+        let mut find = |robot: Option<&str>, file: Option<&Path>| {
+            models
+                .find(robot, file)
+                .map_err(|error| format!("{error:#}"))
+        };
+        return Ok(Config::load(file, &mut find)?.cameras);
+    }
+    let robot = models.find(args.robot.as_deref(), args.weights.as_deref())?;
+    let calibration = match (&args.camera, args.hfov) {
+        (Some(file), _) => Calibration::CameraInfo(Camera::load(file)?),
+        (None, Some(degrees)) => Calibration::Hfov(degrees.to_radians()),
+        (None, None) => Calibration::Assumed,
+    };
+    let cameras = args.source.iter().zip(1..).map(|(source, number)| {
+        let location = Location::new(source, Path::new("")).map_err(anyhow::Error::msg)?;
+        Ok(CameraConfig {
+            calibration,
+            ..CameraConfig::new(format!("camera_{number}"), location, robot)
+        })
+    });
+    cameras.collect()
+}
+
+fn engine(
+    args: Args,
+    models: Models,
+    cameras: usize,
+    mask: bool,
+) -> anyhow::Result<Box<dyn Engine>> {
+    let models: Vec<Model> = models.0.into_iter().map(|(_, model)| model).collect();
+    let precision = args.precision.into();
+    let Some(device) = args.engine.open()? else {
+        engine::ensure_f32(precision)?;
+        return Ok(Box::new(CpuEngine::new(&models, mask)));
+    };
+    let mut first = Some(Arc::clone(&device));
+    let request = args.engine;
+    let reopen = move || -> Result<Arc<Device>, GpuError> {
+        match first.take() {
+            Some(device) => Ok(device),
+            None => request.open()?.ok_or_else(|| GpuError::NoAdapter {
+                backends: "all".into(),
+            }),
+        }
+    };
+    let options = GpuOptions {
+        precision,
+        cameras,
+        mask,
+    };
+    let engine = GpuEngine::new(Box::new(reopen), models, options)?;
+    engine::remember(&device);
+    Ok(Box::new(engine))
+}
+
+/// The models of all cameras, each loaded once.
+#[derive(Default)]
+struct Models(Vec<(PathBuf, Model)>);
+
+impl Models {
+    /// The place of a robot's model or a model file.
+    fn find(&mut self, robot: Option<&str>, file: Option<&Path>) -> anyhow::Result<usize> {
+        if let Some(robot) = robot {
+            weights::robot_name(robot).map_err(anyhow::Error::msg)?;
+        }
+        let path = weights::path(robot, file)?;
+        let known = self.0.iter().position(|(known, _)| *known == path);
+        let place = match known {
+            Some(place) => place,
+            None => {
+                let model = Model::load(&path)?;
+                self.0.push((path.clone(), model));
+                self.0.len() - 1
+            }
+        };
+        if let Some(robot) = robot {
+            let trained_for = self.robot(place);
+            ensure!(
+                robot == trained_for,
+                "{}: robot: expected {robot}, found {trained_for}",
+                path.display()
+            );
+        }
+        Ok(place)
+    }
+
+    /// The robot that a model finds.
+    fn robot(&self, place: usize) -> &str {
+        let model = self.0.get(place);
+        model.map_or("", |(_, model)| &model.description.robot)
+    }
+}

@@ -1,0 +1,73 @@
+//! `cameras.toml`: which cameras there are, and what is to be done with them.
+
+mod camera;
+mod error;
+
+use std::path::Path;
+
+use serde::Deserialize;
+use toml::Spanned;
+
+pub use camera::CameraConfig;
+pub use error::ConfigError;
+pub(in crate::live) use error::Document;
+
+use camera::CameraTable;
+
+/// A configuration file, checked whole.
+#[derive(Debug, Clone)]
+pub struct Config {
+    /// The cameras, in the file's order.
+    pub cameras: Vec<CameraConfig>,
+}
+
+/// The file as it is written. Other parts' tables stand beside the cameras, each a type of its module that knows how
+/// to check itself ([`Document`] says where something is wrong).
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    #[serde(default, rename = "camera")]
+    cameras: Vec<Spanned<CameraTable>>,
+}
+
+/// Gives the place of a model among all models, and loads it if it is new: of a robot's name or a model file or both;
+/// what is wrong with them otherwise.
+pub type FindModel<'a> = dyn FnMut(Option<&str>, Option<&Path>) -> Result<usize, String> + 'a;
+
+impl Config {
+    /// Reads `file`. Paths in it start at its own folder.
+    ///
+    /// # Errors
+    /// A file that cannot be read; unknown keys, wrong values, names that are not unique, files that are not there or
+    /// hold something else: with file, line and key.
+    pub fn load(file: &Path, find_model: &mut FindModel<'_>) -> Result<Self, ConfigError> {
+        let text = std::fs::read_to_string(file).map_err(|cause| ConfigError::Read {
+            file: file.to_owned(),
+            cause,
+        })?;
+        Self::parse(&text, file, find_model)
+    }
+
+    /// Of `text`, which stands in `file`.
+    ///
+    /// # Errors
+    /// As [`Config::load`].
+    pub fn parse(
+        text: &str,
+        file: &Path,
+        find_model: &mut FindModel<'_>,
+    ) -> Result<Self, ConfigError> {
+        let document = Document { file, text };
+        let File { cameras } = toml::from_str(text).map_err(|error| document.refused(&error))?;
+        if cameras.is_empty() {
+            let expected = "expected at least one [[camera]], found none";
+            return Err(document.fault("camera", &Spanned::new(0..0, ()), expected));
+        }
+        let mut checked: Vec<CameraConfig> = Vec::with_capacity(cameras.len());
+        for table in cameras {
+            let camera = table.into_inner().check(&document, &checked, find_model)?;
+            checked.push(camera);
+        }
+        Ok(Self { cameras: checked })
+    }
+}

@@ -1,0 +1,254 @@
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use image::RgbaImage;
+
+use super::Frame;
+use crate::camera::Camera;
+use crate::cascade::{
+    BatchImage, BatchLocator, BatchOptions, Estimate, LocateError, Locator, Output,
+};
+use crate::gpu::{Device, GpuError, Precision, device_type};
+use crate::network::Model;
+
+/// What searches frames, some a submission.
+pub trait Engine: Send {
+    /// How many of `ready` frames (at least one) of robot `robot` go into one submission.
+    fn batch(&self, robot: usize, ready: usize) -> usize;
+
+    /// Submits frames of cameras that look at robot `robot`, as many as [`Engine::batch`] said; not more than
+    /// [`IN_FLIGHT`] submissions are ever on their way. Does not wait for the answers.
+    ///
+    /// # Errors
+    /// A device that was lost: nothing on its way will be answered.
+    fn submit(&mut self, robot: usize, frames: &[Frame]) -> Result<(), LocateError>;
+
+    /// What was found in the frames of the oldest submission, in their order; `None` while it is on its way.
+    /// Never waits.
+    ///
+    /// # Errors
+    /// As [`Engine::submit`].
+    fn finished(&mut self) -> Result<Option<Vec<Estimate>>, LocateError>;
+
+    /// Forgets everything that is on its way, and opens the device again.
+    ///
+    /// # Errors
+    /// What keeps it from being opened now; it may be tried again.
+    fn reopen(&mut self) -> Result<(), LocateError>;
+}
+
+/// Most submissions on their way at the same time: while one runs, the next one is made ready.
+pub const IN_FLIGHT: usize = 2;
+
+/// What opens a device, and opens it again after it was lost.
+pub type OpenDevice = Box<dyn FnMut() -> Result<Arc<Device>, GpuError> + Send>;
+
+/// The cascades of one or several robots on one GPU.
+pub struct GpuEngine {
+    open: OpenDevice,
+    models: Vec<Model>,
+    options: GpuOptions,
+    /// Of each robot, the locators of each batch size, the largest first.
+    robots: Vec<Vec<BatchLocator>>,
+    /// Robot and place of those that run a submission, the oldest first.
+    under_way: VecDeque<(usize, usize)>,
+}
+
+/// What a [`GpuEngine`] is made for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct GpuOptions {
+    /// What activations are stored in.
+    pub precision: Precision,
+    /// How many cameras there are.
+    pub cameras: usize,
+    /// Whether estimates have masks.
+    pub mask: bool,
+}
+
+/// Batch sizes on a GPU: as many images as fill one are submitted at once. A CPU rasteriser takes as long for two
+/// images as for one after the other, and answers the first one sooner so.
+const BATCHES: [usize; 4] = [8, 4, 2, 1];
+
+impl GpuEngine {
+    /// Opens a device, plans `models` on it, and runs each kernel once, so that no frame waits for a compiler.
+    ///
+    /// # Errors
+    /// No device, a layer that exceeds its limits, a driver's refusal.
+    pub fn new(
+        open: OpenDevice,
+        models: Vec<Model>,
+        options: GpuOptions,
+    ) -> Result<Self, LocateError> {
+        let mut engine = Self {
+            open,
+            models,
+            options,
+            robots: Vec::new(),
+            under_way: VecDeque::with_capacity(IN_FLIGHT),
+        };
+        engine.reopen()?;
+        Ok(engine)
+    }
+}
+
+impl Engine for GpuEngine {
+    fn batch(&self, robot: usize, ready: usize) -> usize {
+        let fitting = BATCHES.into_iter().skip(
+            self.robots
+                .get(robot)
+                .map_or(0, |sizes| BATCHES.len() - sizes.len()),
+        );
+        fitting.into_iter().find(|&size| size <= ready).unwrap_or(1)
+    }
+
+    fn submit(&mut self, robot: usize, frames: &[Frame]) -> Result<(), LocateError> {
+        let sizes = self.robots.get_mut(robot);
+        let sizes = sizes.ok_or(LocateError::Shape("robot"))?;
+        let skipped = BATCHES.len() - sizes.len();
+        let place = BATCHES.iter().position(|&size| size == frames.len());
+        let place = place.and_then(|place| place.checked_sub(skipped));
+        let locator = place.and_then(|place| sizes.get_mut(place));
+        let (Some(locator), Some(place)) = (locator, place) else {
+            return Err(LocateError::Shape("batch"));
+        };
+        let images: Vec<BatchImage<'_>> = frames
+            .iter()
+            .map(|frame| BatchImage {
+                place: frame.camera,
+                image: &frame.image,
+                camera: &frame.view,
+            })
+            .collect();
+        if !locator.submit(&images)? {
+            return Err(LocateError::Shape("submissions on their way"));
+        }
+        self.under_way.push_back((robot, place));
+        Ok(())
+    }
+
+    fn finished(&mut self) -> Result<Option<Vec<Estimate>>, LocateError> {
+        let Some(&(robot, place)) = self.under_way.front() else {
+            return Ok(None);
+        };
+        let locator = self.robots.get_mut(robot).and_then(|r| r.get_mut(place));
+        let finished = match locator {
+            Some(locator) => locator.finished()?,
+            None => None,
+        };
+        if finished.is_some() {
+            self.under_way.pop_front();
+        }
+        Ok(finished)
+    }
+
+    fn reopen(&mut self) -> Result<(), LocateError> {
+        self.under_way.clear();
+        self.robots.clear();
+        let device = (self.open)()?;
+        let largest = if device.info().device_type == wgpu::DeviceType::Cpu {
+            1
+        } else {
+            self.options.cameras
+        };
+        log::info!(
+            "{} ({}), batches of up to {largest}",
+            device.info().name,
+            device_type(device.info())
+        );
+        let GpuOptions {
+            precision,
+            cameras,
+            mask,
+        } = self.options;
+        for model in &self.models {
+            let sizes = BATCHES
+                .into_iter()
+                .filter(|&size| size == 1 || size <= largest)
+                .map(|batch| {
+                    let options = BatchOptions {
+                        precision,
+                        cameras,
+                        batch,
+                        in_flight: IN_FLIGHT,
+                        mask,
+                    };
+                    let mut locator = BatchLocator::new(Arc::clone(&device), model, options)?;
+                    warm_up(&mut locator, batch)?;
+                    Ok(locator)
+                })
+                .collect::<Result<Vec<_>, LocateError>>()?;
+            self.robots.push(sizes);
+        }
+        Ok(())
+    }
+}
+
+/// Runs everything once, on blank images.
+fn warm_up(locator: &mut BatchLocator, batch: usize) -> Result<(), LocateError> {
+    let image = RgbaImage::new(8, 8);
+    let camera = Camera::assumed(8, 8);
+    let images: Vec<BatchImage<'_>> = (0..batch)
+        .map(|place| BatchImage {
+            place,
+            image: &image,
+            camera: &camera,
+        })
+        .collect();
+    locator.submit(&images)?;
+    let start = Instant::now();
+    while locator.finished()?.is_none() {
+        if start.elapsed() > Device::TIMEOUT {
+            return Err(GpuError::Timeout(Device::TIMEOUT).into());
+        }
+        std::thread::sleep(Duration::from_micros(200));
+    }
+    Ok(())
+}
+
+/// The cascades in plain Rust: a frame a submission, which it waits for.
+pub struct CpuEngine {
+    locators: Vec<Locator>,
+    output: Output,
+    answers: VecDeque<Vec<Estimate>>,
+}
+
+impl CpuEngine {
+    /// Of `models`, with or without masks.
+    pub fn new(models: &[Model], mask: bool) -> Self {
+        Self {
+            locators: models.iter().map(Locator::on_cpu).collect(),
+            output: Output {
+                mask,
+                mask_only: false,
+            },
+            answers: VecDeque::new(),
+        }
+    }
+}
+
+impl Engine for CpuEngine {
+    fn batch(&self, _robot: usize, _ready: usize) -> usize {
+        1
+    }
+
+    fn submit(&mut self, robot: usize, frames: &[Frame]) -> Result<(), LocateError> {
+        let locator = self.locators.get_mut(robot);
+        let locator = locator.ok_or(LocateError::Shape("robot"))?;
+        let estimates = frames
+            .iter()
+            .map(|frame| locator.locate(&frame.image, &frame.view, self.output))
+            .collect::<Result<_, _>>()?;
+        self.answers.push_back(estimates);
+        Ok(())
+    }
+
+    fn finished(&mut self) -> Result<Option<Vec<Estimate>>, LocateError> {
+        Ok(self.answers.pop_front())
+    }
+
+    fn reopen(&mut self) -> Result<(), LocateError> {
+        self.answers.clear();
+        Ok(())
+    }
+}

@@ -1,0 +1,231 @@
+use std::io::{self, Write};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, TrySendError, channel, sync_channel};
+use std::time::{Duration, SystemTime};
+
+use serde::Serialize;
+
+use super::{Event, EventKind, Observation, Rates, Sink, Statistics};
+use crate::cascade::EstimateLine;
+
+/// JSON Lines: a result a camera a frame, events, and a line of statistics a second. `README.md` lists the keys.
+///
+/// A thread of its own writes them, each line with one write. Where whoever reads them is too slow, lines are lost,
+/// and the next line of statistics says how many.
+pub struct Lines {
+    cameras: Vec<Named>,
+    lines: Option<SyncSender<String>>,
+    /// Hangs up when all lines are written.
+    written: Receiver<()>,
+    lost: Arc<AtomicU64>,
+}
+
+/// What lines say of a camera.
+#[derive(Debug, Clone)]
+pub struct Named {
+    /// Its name.
+    pub camera: String,
+    /// The robot in its view.
+    pub robot: String,
+}
+
+/// The version of the lines.
+const SCHEMA: u32 = 1;
+
+#[derive(Serialize)]
+struct Line<'a> {
+    schema: u32,
+    #[serde(rename = "type")]
+    kind: &'static str,
+    #[serde(flatten)]
+    content: Content<'a>,
+}
+
+#[derive(Serialize)]
+#[serde(untagged)]
+enum Content<'a> {
+    Result {
+        camera: &'a str,
+        robot: &'a str,
+        frame_number: u64,
+        acquired_s: f64,
+        age_ms: f64,
+        #[serde(flatten)]
+        estimate: EstimateLine<'a>,
+    },
+    Event {
+        event: &'static str,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        camera: Option<&'a str>,
+        at_s: f64,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        reason: Option<&'a str>,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        retry_in_s: Option<f64>,
+    },
+    Statistics {
+        at_s: f64,
+        lines_lost: u64,
+        cameras: Vec<CameraRates<'a>>,
+    },
+}
+
+#[derive(Serialize)]
+struct CameraRates<'a> {
+    camera: &'a str,
+    frames_per_s: f64,
+    answers_per_s: f64,
+    dropped: u64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    age_p50_ms: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    age_p99_ms: Option<f64>,
+}
+
+impl Lines {
+    /// Lines that wait to be written, at most.
+    const QUEUE: usize = 1024;
+    /// How long the last lines have to be written.
+    const FAREWELL: Duration = Duration::from_millis(200);
+
+    /// Writes to `output`, in a thread that ends with it. `closed` is told why, once, when `output` takes no more.
+    pub fn new(
+        cameras: Vec<Named>,
+        mut output: impl Write + Send + 'static,
+        closed: impl FnOnce(io::Error) + Send + 'static,
+    ) -> Self {
+        let (lines, queue) = sync_channel::<String>(Self::QUEUE);
+        let (writing, written) = channel();
+        std::thread::spawn(move || {
+            // Hangs up at the end.
+            let _writing = writing;
+            for line in queue {
+                let done = output
+                    .write_all(line.as_bytes())
+                    .and_then(|()| output.flush());
+                if let Err(error) = done {
+                    closed(error);
+                    return;
+                }
+            }
+        });
+        Self {
+            cameras,
+            lines: Some(lines),
+            written,
+            lost: Arc::default(),
+        }
+    }
+
+    fn name(&self, camera: usize) -> &str {
+        self.cameras.get(camera).map_or("", |named| &named.camera)
+    }
+
+    fn write(&self, kind: &'static str, content: Content<'_>) {
+        let line = Line {
+            schema: SCHEMA,
+            kind,
+            content,
+        };
+        let Some(lines) = &self.lines else {
+            return;
+        };
+        match serde_json::to_string(&line) {
+            Ok(text) => {
+                if let Err(TrySendError::Full(_)) = lines.try_send(text + "\n") {
+                    self.lost.fetch_add(1, Ordering::Relaxed);
+                }
+            }
+            Err(error) => log::error!("a line cannot be written: {error}"),
+        }
+    }
+}
+
+impl Sink for Lines {
+    fn observation(&mut self, observation: &Observation) {
+        let robot = self.cameras.get(observation.camera);
+        self.write(
+            "result",
+            Content::Result {
+                camera: self.name(observation.camera),
+                robot: robot.map_or("", |named| &named.robot),
+                frame_number: observation.frame,
+                acquired_s: seconds(observation.acquired),
+                age_ms: milliseconds(observation.age()),
+                estimate: EstimateLine::from(&observation.estimate),
+            },
+        );
+    }
+
+    fn event(&mut self, event: &Event) {
+        let (name, reason, retry_in) = match &event.kind {
+            EventKind::Live => ("live", None, None),
+            EventKind::Stale => ("stale", None, None),
+            EventKind::Failed { reason, retry_in } => ("failed", Some(reason), *retry_in),
+            EventKind::Ended => ("ended", None, None),
+            EventKind::DeviceLost { reason } => ("device_lost", Some(reason), None),
+            EventKind::DeviceBack => ("device_back", None, None),
+        };
+        self.write(
+            "event",
+            Content::Event {
+                event: name,
+                camera: event.camera.map(|camera| self.name(camera)),
+                at_s: seconds(event.at),
+                reason: reason.map(String::as_str),
+                retry_in_s: retry_in.map(|time| time.as_secs_f64()),
+            },
+        );
+    }
+
+    fn statistics(&mut self, statistics: &Statistics) {
+        let cameras = statistics.cameras.iter().zip(&self.cameras);
+        let cameras = cameras.map(|(rates, named)| CameraRates::new(&named.camera, rates));
+        self.write(
+            "statistics",
+            Content::Statistics {
+                at_s: seconds(statistics.at),
+                lines_lost: self.lost.load(Ordering::Relaxed),
+                cameras: cameras.collect(),
+            },
+        );
+    }
+}
+
+impl Drop for Lines {
+    fn drop(&mut self) {
+        self.lines = None;
+        // A reader that does not read does not keep us.
+        let _ = self.written.recv_timeout(Self::FAREWELL);
+    }
+}
+
+impl<'a> CameraRates<'a> {
+    fn new(camera: &'a str, rates: &Rates) -> Self {
+        let rounded = |value: f64| (10.0 * value).round() / 10.0;
+        Self {
+            camera,
+            frames_per_s: rounded(rates.frames_per_s),
+            answers_per_s: rounded(rates.answers_per_s),
+            dropped: rates.dropped,
+            age_p50_ms: rates.age_p50.map(milliseconds),
+            age_p99_ms: rates.age_p99.map(milliseconds),
+        }
+    }
+}
+
+/// Since 1970 (Unix time), to microseconds.
+fn seconds(time: SystemTime) -> f64 {
+    let since = time.duration_since(SystemTime::UNIX_EPOCH);
+    // A clock that was set to before 1970 is still a clock.
+    let micros = match since {
+        Ok(after) => after.as_micros() as f64,
+        Err(before) => -(before.duration().as_micros() as f64),
+    };
+    micros / 1e6
+}
+
+fn milliseconds(time: Duration) -> f64 {
+    (time.as_secs_f64() * 1e6).round() / 1e3
+}

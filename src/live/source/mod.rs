@@ -1,0 +1,90 @@
+//! Where frames come from.
+
+mod child;
+mod ffmpeg;
+mod folder;
+mod location;
+mod pace;
+mod recording;
+mod showinfo;
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use image::RgbaImage;
+
+pub use location::Location;
+
+use super::Stop;
+use crate::camera::{Camera, CameraError};
+use crate::recording::RecordingError;
+
+/// What gives a camera's frames. It is opened again after it failed.
+pub trait Source: Send {
+    /// Opens it. Whoever waits for a frame of it returns soon after `stop` is set.
+    ///
+    /// # Errors
+    /// What keeps it from being opened now; it may be tried again.
+    fn open(&mut self, stop: &Arc<Stop>) -> Result<Box<dyn Stream>, SourceError>;
+}
+
+/// A source that is open; dropped, it is closed.
+pub trait Stream {
+    /// Waits for the next frame and makes `image` it. `None` at the source's end, or when everything is to stop.
+    ///
+    /// # Errors
+    /// [`SourceError::Frame`] for a frame that is none: the stream goes on with the next one. After any other,
+    /// it is of no use any more.
+    fn next(&mut self, image: &mut RgbaImage) -> Result<Option<Shot>, SourceError>;
+}
+
+/// What there is to know about a frame besides its pixels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Shot {
+    /// When it was taken, by the wall clock.
+    pub acquired: SystemTime,
+    /// The same by the monotonic clock.
+    pub acquired_at: Instant,
+    /// Its camera, where the source knows.
+    pub camera: Option<Camera>,
+}
+
+impl Shot {
+    /// Of a frame that is taken now.
+    pub fn now() -> Self {
+        Self {
+            acquired: SystemTime::now(),
+            acquired_at: Instant::now(),
+            camera: None,
+        }
+    }
+}
+
+/// Why a source gives no frames.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SourceError {
+    /// A frame that is none. The next one may be.
+    #[error("{0}")]
+    Frame(String),
+    /// The frame is not the camera's.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
+    /// A recording that cannot be read.
+    #[error(transparent)]
+    Recording(#[from] RecordingError),
+    /// A folder that cannot be read, or has no images.
+    #[error("{0}")]
+    Folder(String),
+    /// `ffmpeg` is not there, or cannot be started.
+    #[error(
+        "ffmpeg cannot be started ({0}): it reads videos, streams and webcams, and must be installed and on the PATH"
+    )]
+    NoFfmpeg(std::io::Error),
+    /// `ffmpeg` ended, or gave something else than frames.
+    #[error("{0}")]
+    Ffmpeg(String),
+    /// No frame came for so long.
+    #[error("no frame for {0:?}")]
+    Stalled(Duration),
+}

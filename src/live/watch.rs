@@ -1,0 +1,181 @@
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::thread;
+use std::time::{Duration, Instant, SystemTime};
+
+use super::engine::Engine;
+use super::mailbox::Mailboxes;
+use super::message::Message;
+use super::pulse::Pulse;
+use super::reader::Reader;
+use super::scheduler::Scheduler;
+use super::{Event, EventKind, Input, Sink, Statistics, Stop};
+
+/// Watches cameras until `stop` is set, or all sources came to their end and all their frames are answered. `sinks`
+/// are dropped at the end.
+///
+/// Threads that cannot be stopped in time (a driver that does not return) are left behind.
+pub fn watch(
+    inputs: Vec<Input>,
+    engine: Box<dyn Engine>,
+    sinks: Vec<Box<dyn Sink>>,
+    stop: &Arc<Stop>,
+) {
+    let mailboxes = Arc::new(Mailboxes::new(inputs.len()));
+    let (sender, messages) = channel();
+    let robots = inputs.iter().map(|input| input.robot).collect();
+    let pulses = inputs.iter().map(|_| Pulse::default()).collect();
+    let scheduler = Scheduler::new(
+        engine,
+        robots,
+        Arc::clone(&mailboxes),
+        sender.clone(),
+        Arc::clone(stop),
+    );
+    thread::spawn(move || scheduler.run());
+    for (camera, input) in inputs.into_iter().enumerate() {
+        let reader = Reader {
+            camera,
+            input,
+            mailboxes: Arc::clone(&mailboxes),
+            messages: sender.clone(),
+            stop: Arc::clone(stop),
+        };
+        thread::spawn(move || reader.run());
+    }
+    drop(sender);
+    Desk {
+        sinks,
+        pulses,
+        mailboxes,
+        ticked: Instant::now(),
+    }
+    .run(&messages, stop);
+}
+
+/// Where all that happens comes together, in order.
+struct Desk {
+    sinks: Vec<Box<dyn Sink>>,
+    pulses: Vec<Pulse>,
+    mailboxes: Arc<Mailboxes>,
+    /// When the last second was over.
+    ticked: Instant,
+}
+
+impl Desk {
+    const SECOND: Duration = Duration::from_secs(1);
+    /// The longest wait for anything.
+    const LOOK: Duration = Duration::from_millis(50);
+    /// Most messages between two looks at the clock.
+    const MOST: usize = 1000;
+    /// How long threads have to end.
+    const FAREWELL: Duration = Duration::from_millis(400);
+
+    fn run(mut self, messages: &Receiver<Message>, stop: &Stop) {
+        while !stop.is_set() {
+            // A frame that came in time is not late because we are.
+            for message in messages.try_iter().take(Self::MOST) {
+                self.handle(message);
+            }
+            let now = Instant::now();
+            self.look(now);
+            match messages.recv_timeout(self.wait(now)) {
+                Ok(message) => self.handle(message),
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => return,
+            }
+        }
+        // Until all threads have hung up.
+        let end = Instant::now() + Self::FAREWELL;
+        while let Some(left) = end.checked_duration_since(Instant::now()) {
+            match messages.recv_timeout(left) {
+                Ok(message) => self.handle(message),
+                Err(_) => return,
+            }
+        }
+    }
+
+    /// Until something is due.
+    fn wait(&self, now: Instant) -> Duration {
+        let deadlines = self.pulses.iter().filter_map(Pulse::deadline);
+        let due = deadlines.chain([self.ticked + Self::SECOND]).min();
+        let wait = due.map_or(Self::LOOK, |due| due.saturating_duration_since(now));
+        // A deadline is over a moment after it.
+        (wait + Duration::from_micros(1)).min(Self::LOOK)
+    }
+
+    /// What has become due.
+    fn look(&mut self, now: Instant) {
+        for camera in 0..self.pulses.len() {
+            let pulse = self.pulses.get_mut(camera);
+            if pulse.is_some_and(|pulse| pulse.is_overdue(now)) {
+                self.event(Some(camera), EventKind::Stale);
+            }
+        }
+        let elapsed = now.saturating_duration_since(self.ticked);
+        if elapsed >= Self::SECOND {
+            self.ticked = now;
+            let cameras = self.pulses.iter_mut().enumerate();
+            let cameras =
+                cameras.map(|(camera, p)| p.rates(elapsed, self.mailboxes.dropped(camera)));
+            let statistics = Statistics {
+                at: SystemTime::now(),
+                cameras: cameras.collect(),
+            };
+            for sink in &mut self.sinks {
+                sink.statistics(&statistics);
+            }
+        }
+    }
+
+    fn handle(&mut self, message: Message) {
+        match message {
+            Message::Arrived { camera, at } => {
+                let pulse = self.pulses.get_mut(camera);
+                if pulse.is_some_and(|pulse| pulse.arrived(at)) {
+                    self.event(Some(camera), EventKind::Live);
+                }
+            }
+            Message::Failed {
+                camera,
+                reason,
+                retry_in,
+            } => {
+                self.silence(camera);
+                let retry_in = Some(retry_in);
+                self.event(Some(camera), EventKind::Failed { reason, retry_in });
+            }
+            Message::Ended { camera } => {
+                self.silence(camera);
+                self.event(Some(camera), EventKind::Ended);
+            }
+            Message::Answered(observation) => {
+                if let Some(pulse) = self.pulses.get_mut(observation.camera) {
+                    pulse.answered(observation.age());
+                }
+                for sink in &mut self.sinks {
+                    sink.observation(&observation);
+                }
+            }
+            Message::DeviceLost { reason } => self.event(None, EventKind::DeviceLost { reason }),
+            Message::DeviceBack => self.event(None, EventKind::DeviceBack),
+        }
+    }
+
+    fn silence(&mut self, camera: usize) {
+        if let Some(pulse) = self.pulses.get_mut(camera) {
+            pulse.silenced();
+        }
+    }
+
+    fn event(&mut self, camera: Option<usize>, kind: EventKind) {
+        let event = Event {
+            at: SystemTime::now(),
+            camera,
+            kind,
+        };
+        for sink in &mut self.sinks {
+            sink.event(&event);
+        }
+    }
+}

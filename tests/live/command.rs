@@ -1,0 +1,175 @@
+//! `whereabot watch`: lines, signals, exit codes.
+
+use std::io::{BufRead, BufReader};
+use std::process::Stdio;
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+use super::program::{Program, command, folder, watch};
+use super::sources;
+
+const PHOTOS: &str = "[[camera]]\nname = \"left\"\nsource = \"photos\"\nweights = \"model.safetensors\"\n\
+                      hfov = 70\nfps = 20\n";
+
+#[test]
+fn lines_say_what_was_found_and_when() {
+    let folder = folder(PHOTOS);
+    sources::folder(&folder.path().join("photos"), 30);
+    let before = std::time::SystemTime::now();
+    let mut program = watch(folder.path(), None);
+    let first = program.wait_for_result("left");
+    assert_eq!(first["schema"], 1);
+    assert_eq!(first["robot"], "cube");
+    assert_eq!(first["status"], "found");
+    assert_eq!(first["frame"], "camera_optical");
+    assert_eq!(first["joints"].as_array().unwrap().len(), 6);
+    assert_eq!(first["joints"][0]["name"], "shoulder_pan");
+    assert!(first["bbox_px"].is_array() && first["coverage"].as_f64().unwrap() > 0.0);
+    let since = |time: std::time::SystemTime| {
+        let since = time.duration_since(std::time::UNIX_EPOCH).unwrap();
+        since.as_secs_f64()
+    };
+    let acquired = first["acquired_s"].as_f64().unwrap();
+    let now = std::time::SystemTime::now();
+    assert!(since(before) <= acquired && acquired <= since(now));
+    assert!(first["age_ms"].as_f64().unwrap() > 0.0);
+    let statistics = program.wait_for("statistics", |line| line["type"] == "statistics");
+    let left = &statistics["cameras"][0];
+    assert_eq!(left["camera"], "left");
+    assert!(left["answers_per_s"].as_f64().unwrap() > 0.0);
+    assert!(left["age_p99_ms"].as_f64() >= left["age_p50_ms"].as_f64());
+    // It ends by itself, with everything said.
+    let (status, _) = program.end();
+    assert!(status.success());
+    let of = |kind: &str, key: &str| program.seen.iter().filter(|l| l[key] == kind).count();
+    assert_eq!((of("live", "event"), of("ended", "event")), (1, 1));
+    let last = program.seen.iter().rfind(|line| line["type"] == "result");
+    assert_eq!(last.unwrap()["frame_number"], 29);
+}
+
+#[test]
+fn signals_end_it_in_time_with_a_whole_line() {
+    for signal in ["INT", "TERM"] {
+        let config = PHOTOS.to_owned()
+            + "repeat = true\n"
+            + "[[camera]]\nname = \"video\"\nsource = \"clip.mkv\"\nweights = \"model.safetensors\"\nhfov = 70\n";
+        let folder = folder(&config);
+        sources::folder(&folder.path().join("photos"), 5);
+        sources::video(&folder.path().join("clip.mkv"), 60);
+        let mut program = watch(folder.path(), None);
+        program.wait_for_result("video");
+        program.wait_for_result("left");
+        program.signal(signal);
+        let (status, took) = program.end();
+        assert_eq!(status.code(), Some(0), "{signal}");
+        println!("SIG{signal}: ended after {took:?}");
+        assert!(took < Duration::from_secs(2), "SIG{signal}: {took:?}");
+    }
+}
+
+#[test]
+fn on_a_gpu_it_says_the_same_and_ends_as_soon() {
+    let folder = folder(&(PHOTOS.to_owned() + "repeat = true\n"));
+    sources::folder(&folder.path().join("photos"), 5);
+    let mut on_gpu = command(folder.path());
+    on_gpu.arg("cameras.toml");
+    let mut programs = [Program::start(on_gpu), watch(folder.path(), None)];
+    let number = |line: &Value| line["frame_number"].as_u64().unwrap() % 5;
+    let [gpu, cpu] = [0, 1].map(|p| programs[p].wait_for_result("left"));
+    // The pictures repeat: the same picture of both.
+    let other = programs[1].wait_for("picture", |line| {
+        line["type"] == "result" && number(line) == number(&gpu)
+    });
+    let near = |a: &Value, b: &Value| {
+        let [a, b] = [a, b].map(|line| line["joints"][2]["xyz_m"][0].as_f64().unwrap());
+        (a - b).abs() < 1e-4
+    };
+    assert!(near(&gpu, &other));
+    // Negative control: another picture's are others.
+    let another = programs[1].wait_for("another", |line| {
+        line["type"] == "result" && number(line) != number(&gpu)
+    });
+    assert!(!near(&gpu, &another), "{gpu} {another}");
+    assert_eq!(cpu["status"], "found");
+    programs[0].signal("TERM");
+    let (status, took) = programs[0].end();
+    println!("on a GPU: ended after {took:?}");
+    assert!(
+        status.success() && took < Duration::from_secs(2),
+        "{took:?}"
+    );
+}
+
+#[test]
+fn a_reader_that_leaves_ends_it() {
+    let folder = folder(&(PHOTOS.to_owned() + "repeat = true\n"));
+    sources::folder(&folder.path().join("photos"), 5);
+    let mut child = command(folder.path())
+        .args(["--adapter", "cpu", "cameras.toml"])
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    let mut output = BufReader::new(child.stdout.take().unwrap());
+    output.read_line(&mut line).unwrap();
+    serde_json::from_str::<Value>(&line).unwrap();
+    drop(output);
+    let start = Instant::now();
+    assert!(child.wait().unwrap().success());
+    assert!(start.elapsed() < Duration::from_secs(5));
+}
+
+#[test]
+fn cameras_can_do_without_a_file() {
+    let folder = folder("");
+    sources::folder(&folder.path().join("a"), 2);
+    sources::folder(&folder.path().join("b"), 2);
+    let mut command = command(folder.path());
+    command.args(["--adapter", "cpu", "--weights", "model.safetensors"]);
+    command.args(["--hfov", "70", "--source", "a", "--source", "b"]);
+    let mut program = Program::start(command);
+    let (status, _) = program.end();
+    assert!(status.success());
+    for camera in ["camera_1", "camera_2"] {
+        let of = |l: &&Value| l["type"] == "result" && l["camera"] == camera;
+        assert_eq!(program.seen.iter().filter(of).count(), 2);
+    }
+}
+
+#[test]
+fn what_is_wrong_is_said_before_anything_starts() {
+    let folder =
+        folder("[[camera]]\nname = \"a\"\nsource = \"gone\"\nweights = \"model.safetensors\"\n");
+    sources::folder(&folder.path().join("a"), 2);
+    std::fs::write(folder.path().join("clip.mkv"), b"").unwrap();
+    let cases: [(&[&str], i32, &str); 6] = [
+        (
+            &["cameras.toml"],
+            1,
+            "cameras.toml:3: camera.source: expected",
+        ),
+        (&["none.toml"], 1, "none.toml"),
+        (&[], 2, "CAMERAS.TOML"),
+        (&["cameras.toml", "--source", "a"], 2, "cannot be used with"),
+        (&["--source", "a", "--weights", "none"], 1, "none"),
+        (
+            &["--source", "clip.mkv", "--weights", "model.safetensors"],
+            1,
+            "ffmpeg",
+        ),
+    ];
+    for (arguments, code, text) in cases {
+        let output = command(folder.path())
+            .args(["--adapter", "cpu"])
+            .args(arguments)
+            // No ffmpeg there.
+            .env("PATH", folder.path())
+            .output()
+            .unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(code), "{arguments:?}: {said}");
+        assert!(said.contains(text), "{arguments:?}: {said}");
+        assert!(output.stdout.is_empty());
+    }
+}

@@ -1,0 +1,199 @@
+//! `cameras.toml`: what it may say, and what it is told otherwise.
+
+use std::path::Path;
+
+use whereabot::camera::Orientation;
+use whereabot::live::{Calibration, CameraConfig, Config, Location};
+
+/// Robots are found by name; files too.
+fn find(robot: Option<&str>, weights: Option<&Path>) -> Result<usize, String> {
+    match (robot, weights) {
+        (_, Some(file)) if !file.exists() => Err(format!("no file {}", file.display())),
+        (Some("ur9"), _) => Err("no weights for robot `ur9`".into()),
+        (Some("ur10"), _) => Ok(1),
+        _ => Ok(0),
+    }
+}
+
+fn folder() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    super::sources::folder(&folder.path().join("photos"), 1);
+    std::fs::create_dir(folder.path().join("empty")).unwrap();
+    std::fs::write(folder.path().join("clip.mp4"), b"").unwrap();
+    let info =
+        "image_width: 64\nimage_height: 48\ncamera_matrix: {data: [9, 0, 5, 0, 9, 5, 0, 0, 1]}\n";
+    std::fs::write(folder.path().join("info.yaml"), info).unwrap();
+    folder
+}
+
+fn parse(folder: &Path, text: &str) -> Result<Vec<CameraConfig>, String> {
+    let config = Config::parse(text, &folder.join("cameras.toml"), &mut find);
+    config.map(|c| c.cameras).map_err(|error| error.to_string())
+}
+
+#[test]
+fn a_file_is_what_it_says() {
+    let folder = folder();
+    let text = r#"
+        [[camera]]
+        name = "a"
+        source = "photos"
+        fps = 2
+        repeat = true
+        camera_info = "info.yaml"
+        orientation = "rotate_90"
+
+        [[camera]]
+        name = "b"
+        source = "rtsp://10.0.0.1/x"
+        robot = "ur10"
+        hfov = 90.0
+
+        [[camera]]
+        name = "c"
+        source = "clip.mp4"
+    "#;
+    let cameras = parse(folder.path(), text).unwrap();
+    let [a, b, c] = cameras.as_slice() else {
+        panic!("{cameras:?}");
+    };
+    assert_eq!(a.location, Location::Folder(folder.path().join("photos")));
+    assert_eq!((a.fps, a.repeat, a.robot), (Some(2.0), true, 0));
+    assert_eq!(a.orientation, Orientation::Rotate90);
+    assert!(matches!(a.calibration, Calibration::CameraInfo(camera) if camera.width == 64));
+    assert_eq!(b.location, Location::Stream("rtsp://10.0.0.1/x".into()));
+    assert_eq!((b.fps, b.repeat, b.robot), (None, false, 1));
+    assert_eq!(b.calibration, Calibration::Hfov(90_f64.to_radians()));
+    assert_eq!(c.location, Location::Video(folder.path().join("clip.mp4")));
+    assert_eq!(c.calibration, Calibration::Assumed);
+}
+
+#[test]
+fn the_example_is_one() {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/cameras.toml");
+    let config = Config::load(&file, &mut find).unwrap();
+    assert_eq!(config.cameras.len(), 1);
+    // What is commented out is valid too, but for sources that are not here.
+    let text = std::fs::read_to_string(&file).unwrap();
+    let uncommented: Vec<&str> = text
+        .lines()
+        .map(|line| {
+            let bare = line.strip_prefix("# ").unwrap_or(line);
+            let is_code = bare.starts_with("[[") || bare.contains(" = ");
+            if is_code { bare } else { line }
+        })
+        .filter(|line| !line.contains("door.yaml"))
+        .collect();
+    let text = uncommented
+        .join("\n")
+        .replace("\"../recordings/ur5_1\"", "\"images\"")
+        .replace("\"clip.mp4\"", "\"http://x/clip\"")
+        .replace("source = 0\nfps = 30", "source = \"http://x/0\"");
+    let config = Config::parse(&text, &file, &mut find).unwrap();
+    assert_eq!(config.cameras.len(), 5);
+}
+
+#[test]
+fn what_is_wrong_is_told_with_file_line_and_key() {
+    let folder = folder();
+    let head = "[[camera]]\nname = \"a\"\nsource = \"photos\"\n";
+    // The fault's line, what is said, and the text.
+    let cases = [
+        (1, "camera: expected at least one", String::new()),
+        (4, "unknown field `colour`", format!("{head}colour = 1\n")),
+        (4, "cameras: unknown field", format!("{head}[[cameras]]\n")),
+        (
+            1,
+            "missing field `source`",
+            "[[camera]]\nname = \"a\"\n".into(),
+        ),
+        (
+            5,
+            "camera.name: expected a name of its own",
+            format!("{head}[[camera]]\nname = \"a\"\nsource = \"photos\"\n"),
+        ),
+        (
+            2,
+            "camera.name: expected a name",
+            "[[camera]]\nname = \" \"\nsource = \"photos\"\n".into(),
+        ),
+        (
+            3,
+            "camera.source: expected",
+            "[[camera]]\nname = \"a\"\nsource = \"nothing\"\n".into(),
+        ),
+        (
+            3,
+            "no images",
+            "[[camera]]\nname = \"a\"\nsource = \"empty\"\n".into(),
+        ),
+        (
+            3,
+            "/dev/video77",
+            "[[camera]]\nname = \"a\"\nsource = 77\n".into(),
+        ),
+        (
+            3,
+            "a webcam's number, a path",
+            "[[camera]]\nname = \"a\"\nsource = 1.5\n".into(),
+        ),
+        (
+            4,
+            "camera.robot: no weights for robot `ur9`",
+            format!("{head}robot = \"ur9\"\n"),
+        ),
+        (
+            4,
+            "camera.weights: no file",
+            format!("{head}weights = \"x.safetensors\"\n"),
+        ),
+        (
+            4,
+            "camera.camera_info: ",
+            format!("{head}camera_info = \"x.yaml\"\n"),
+        ),
+        (
+            5,
+            "camera.hfov: expected camera_info or hfov",
+            format!("{head}camera_info = \"info.yaml\"\nhfov = 70\n"),
+        ),
+        (
+            4,
+            "camera.hfov: expected degrees",
+            format!("{head}hfov = 180\n"),
+        ),
+        (4, "camera.fps: expected 0 to", format!("{head}fps = 0\n")),
+        (4, "camera.fps: expected 0 to", format!("{head}fps = nan\n")),
+        (4, "fps: invalid type", format!("{head}fps = \"x\"\n")),
+        (
+            4,
+            "camera.fps: expected none",
+            "[[camera]]\nname = \"a\"\nsource = \"clip.mp4\"\nfps = 3\n".into(),
+        ),
+        (
+            4,
+            "camera.repeat: expected none",
+            "[[camera]]\nname = \"a\"\nsource = \"http://x\"\nrepeat = true\n".into(),
+        ),
+        (
+            4,
+            "unknown variant `left`",
+            format!("{head}orientation = \"left\"\n"),
+        ),
+        (
+            3,
+            "",
+            "[[camera]]\nname = \"a\"\nsource = \"photos\n".into(),
+        ),
+    ];
+    for (line, said, text) in cases {
+        let error = parse(folder.path(), &text).unwrap_err();
+        let place = format!("cameras.toml:{line}: ");
+        assert!(
+            error.contains(&place) && error.contains(said),
+            "{text}\n{error}"
+        );
+    }
+    // Negative control.
+    parse(folder.path(), head).unwrap();
+}

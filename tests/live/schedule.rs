@@ -1,0 +1,153 @@
+//! Newest frame wins, overload is shared, cameras do not wait for each other.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::simulated::{Collector, Simulated, StandIn};
+use whereabot::live::{EventKind, Input, Observation, Stop, watch};
+
+const MS: Duration = Duration::from_millis(1);
+
+fn run(inputs: Vec<Input>, engine: StandIn) -> Collector {
+    let collector = Collector::default();
+    let sinks = vec![Box::new(collector.clone()) as _];
+    watch(inputs, Box::new(engine), sinks, &Arc::new(Stop::default()));
+    collector
+}
+
+/// The 99th percentile of the ages but for the first frames', when nothing is known of the engine.
+fn age_p99(observations: &[Observation]) -> Duration {
+    let mut ages: Vec<_> = observations
+        .iter()
+        .filter(|o| o.frame > 5)
+        .map(Observation::age)
+        .collect();
+    ages.sort();
+    ages[(ages.len() * 99).div_ceil(100) - 1]
+}
+
+/// How many of a camera's frames got answers.
+fn answers(observations: &[Observation], cameras: usize) -> Vec<usize> {
+    let of = |camera| observations.iter().filter(|o| o.camera == camera).count();
+    (0..cameras).map(of).collect()
+}
+
+fn are_even(counts: &[usize]) -> bool {
+    counts.iter().max().unwrap() - counts.iter().min().unwrap() <= 2
+}
+
+#[test]
+fn overload_drops_evenly_and_answers_stay_young() {
+    const CAMERAS: usize = 64;
+    let service = 250 * MS;
+    let cameras = || (0..CAMERAS).map(|_| Simulated::new(100 * MS, 40).input());
+    let collector = run(cameras().collect(), StandIn::new(service, CAMERAS));
+    let observations = collector.observations();
+    let counts = answers(&observations, CAMERAS);
+    assert!(are_even(&counts), "{counts:?}");
+    // Ten frames a second, four answers.
+    assert!(
+        counts.iter().all(|count| (8..30).contains(count)),
+        "{counts:?}"
+    );
+    let p99 = age_p99(&observations);
+    println!("64 cameras, service {service:?}: age p99 {p99:?}, answers {counts:?}");
+    assert!(p99 <= 2 * service, "{p99:?}");
+    // Of each camera in order; what lies between was dropped, and counted.
+    for camera in 0..CAMERAS {
+        let mut frames = observations.iter().filter(|o| o.camera == camera);
+        let first = frames.next().unwrap().frame;
+        frames.fold(first, |last, next| {
+            assert!(next.frame > last);
+            next.frame
+        });
+    }
+    let statistics = collector.statistics();
+    let dropped = |camera: usize| statistics.last().unwrap().cameras[camera].dropped as usize;
+    assert!((0..CAMERAS).all(|c| dropped(c) > 0 && dropped(c) + counts[c] <= 40));
+
+    // Negative controls: an engine that takes four times as long, and a camera that gives half as much.
+    let slow = run(cameras().collect(), StandIn::new(4 * service, CAMERAS));
+    assert!(age_p99(&slow.observations()) > 2 * service);
+    let mut uneven: Vec<Input> = cameras().take(3).collect();
+    uneven.push(Simulated::new(100 * MS, 4).input());
+    let uneven = run(uneven, StandIn::new(service / 4, CAMERAS));
+    assert!(!are_even(&answers(&uneven.observations(), 4)));
+}
+
+#[test]
+fn small_batches_are_shared_too() {
+    let cameras = (0..12).map(|_| Simulated::new(30 * MS, 80).input());
+    let collector = run(cameras.collect(), StandIn::new(60 * MS, 4));
+    let counts = answers(&collector.observations(), 12);
+    assert!(are_even(&counts) && counts[0] > 5, "{counts:?}");
+}
+
+#[test]
+fn without_overload_every_frame_is_answered() {
+    let cameras = (0..4).map(|_| Simulated::new(100 * MS, 10).input());
+    let collector = run(cameras.collect(), StandIn::new(5 * MS, 1));
+    let observations = collector.observations();
+    assert_eq!(answers(&observations, 4), [10; 4]);
+    let live = |camera| (Some(camera), EventKind::Live);
+    let ended = |camera| (Some(camera), EventKind::Ended);
+    let events = collector.events();
+    for camera in 0..4 {
+        assert!(events.contains(&live(camera)) && events.contains(&ended(camera)));
+    }
+}
+
+#[test]
+fn a_camera_that_pauses_is_stale_and_no_other_is_disturbed() {
+    let paused = Simulated {
+        pause: Some((10, 1500 * MS)),
+        ..Simulated::new(50 * MS, 20)
+    };
+    let steady = Simulated::new(50 * MS, 50);
+    let collector = run(
+        vec![paused.input(), steady.input()],
+        StandIn::new(5 * MS, 2),
+    );
+    let told = collector.told.lock().unwrap().clone();
+    let events: Vec<_> = collector
+        .events()
+        .into_iter()
+        .filter(|(camera, _)| *camera == Some(0))
+        .map(|(_, kind)| kind)
+        .collect();
+    use EventKind::{Ended, Live, Stale};
+    assert_eq!(events, [Live, Stale, Live, Ended]);
+    // In time: before the pause was half over.
+    let observations = collector.observations();
+    let of_0 = |frame| {
+        observations
+            .iter()
+            .find(|o| o.camera == 0 && o.frame == frame)
+    };
+    let last = of_0(9).unwrap().acquired;
+    let stale = told.iter().find_map(|told| match told {
+        super::simulated::Told::Event(event) if event.kind == Stale => Some(event.at),
+        _ => None,
+    });
+    let late = stale.unwrap().duration_since(last).unwrap();
+    assert!((150 * MS..750 * MS).contains(&late), "{late:?}");
+    assert_eq!(answers(&observations, 2)[1], 50);
+}
+
+#[test]
+fn a_clock_that_jumps_back_changes_no_age_and_no_order() {
+    let hour = Duration::from_secs(3600);
+    let camera = Simulated {
+        clock_back: Some((5, hour)),
+        ..Simulated::new(50 * MS, 10)
+    };
+    let collector = run(vec![camera.input()], StandIn::new(5 * MS, 1));
+    let observations = collector.observations();
+    let frames: Vec<_> = observations.iter().map(|o| o.frame).collect();
+    assert_eq!(frames, (0..10).collect::<Vec<_>>());
+    assert!(observations.iter().all(|o| o.age() < hour / 2));
+    // It did jump.
+    assert!(observations[5].acquired < observations[4].acquired);
+    let stale = |(_, kind): &(_, EventKind)| *kind == EventKind::Stale;
+    assert!(!collector.events().iter().any(stale));
+}
