@@ -4,6 +4,7 @@
 //! replaces it; the scheduler takes what is fresh from all mailboxes into one submission; what was found
 //! goes to every [`Sink`] as an [`Observation`].
 
+pub mod mcap;
 mod observation;
 
 pub use observation::{Event, EventKind, Observation, Rates, Sink, Statistics};
