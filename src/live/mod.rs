@@ -11,6 +11,7 @@ mod input;
 mod lines;
 mod mailbox;
 mod message;
+pub mod mcap;
 mod observation;
 mod pulse;
 mod reader;

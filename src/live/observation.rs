@@ -99,6 +99,11 @@ pub struct Statistics {
 /// Where results go. Calls come from one thread, in order, and must not wait: what writes to a disk or a network has
 /// a thread and a bounded queue of its own.
 pub trait Sink: Send {
+    /// Whether it needs the masks of the estimates, which are read back only then.
+    fn wants_masks(&self) -> bool {
+        false
+    }
+
     /// A frame was searched.
     fn observation(&mut self, observation: &Observation);
 
@@ -108,8 +113,11 @@ pub trait Sink: Send {
     /// A second is over.
     fn statistics(&mut self, statistics: &Statistics);
 
-    /// Whether it needs the masks of the estimates, which are read back only then.
-    fn wants_masks(&self) -> bool {
-        false
+    /// Nothing more comes: what is waiting is brought to its end, within a second.
+    ///
+    /// # Errors
+    /// Why the sink gave up, also where that was long ago and it only ignored what came since.
+    fn finish(&mut self) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+        Ok(())
     }
 }
