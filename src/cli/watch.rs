@@ -16,11 +16,12 @@ use super::locate::field_of_view;
 use super::weights;
 use crate::camera::Camera;
 use crate::gpu::{Device, GpuError};
+use crate::live::mcap::{RecordedCamera, Recorder};
 use crate::live::{
     Calibration, CameraConfig, Config, CpuEngine, Engine, GpuEngine, GpuOptions, Lines, Location,
     Named, Sink, Stop, watch,
 };
-use crate::network::Model;
+use crate::network::{Description, Model};
 
 /// Find the robots in the frames of many cameras, live
 ///
@@ -50,6 +51,9 @@ pub struct Args {
     /// With --source: the cameras' horizontal field of view
     #[arg(long, value_name = "DEGREES", value_parser = field_of_view, conflicts_with = "config")]
     hfov: Option<f64>,
+    /// A new file for what the cameras saw and what was found: MCAP, ROS 2 messages
+    #[arg(long, value_name = "FILE")]
+    record: Option<PathBuf>,
     /// What to store activations in; f16 is for GPUs
     #[arg(long, value_enum, value_name = "NAME", default_value = "f32")]
     precision: PrecisionName,
@@ -74,13 +78,17 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
         }
     }
     let stop = Arc::new(Stop::default());
-    let sinks = sinks(&cameras, &models, &stop);
+    let sinks = sinks(&args, &cameras, &models, &stop)?;
     let mask = sinks.iter().any(|sink| sink.wants_masks());
     let engine = engine(args, models, cameras.len(), mask)?;
     stop_on_signals(&stop).context("signals cannot be handled")?;
     let inputs = cameras.iter().map(CameraConfig::input).collect();
-    watch(inputs, engine, sinks, &stop);
-    Ok(ExitCode::SUCCESS)
+    let mut done = ExitCode::SUCCESS;
+    for error in watch(inputs, engine, sinks, &stop) {
+        log::error!("{error}");
+        done = ExitCode::FAILURE;
+    }
+    Ok(done)
 }
 
 /// Sets `stop` on Ctrl-C and SIGTERM.
@@ -102,7 +110,12 @@ fn stop_on_signals(stop: &Arc<Stop>) -> io::Result<()> {
 }
 
 /// Where results go.
-fn sinks(cameras: &[CameraConfig], models: &Models, stop: &Arc<Stop>) -> Vec<Box<dyn Sink>> {
+fn sinks(
+    args: &Args,
+    cameras: &[CameraConfig],
+    models: &Models,
+    stop: &Arc<Stop>,
+) -> anyhow::Result<Vec<Box<dyn Sink>>> {
     let named = cameras.iter().map(|camera| Named {
         camera: camera.name.clone(),
         robot: models.robot(camera.robot).to_owned(),
@@ -115,7 +128,21 @@ fn sinks(cameras: &[CameraConfig], models: &Models, stop: &Arc<Stop>) -> Vec<Box
         // The reader, such as `head`, has what it wanted.
         closed.set();
     });
-    vec![Box::new(lines)]
+    let mut sinks: Vec<Box<dyn Sink>> = vec![Box::new(lines)];
+    if let Some(file) = &args.record {
+        let recorded = cameras.iter().map(|camera| {
+            let description = models.description(camera.robot)?;
+            Some(RecordedCamera {
+                name: camera.name.clone(),
+                robot: description.robot.clone(),
+                joints: description.joints.clone(),
+                canonical: description.camera,
+            })
+        });
+        let recorded: Vec<_> = recorded.flatten().collect();
+        sinks.push(Box::new(Recorder::create(file, &recorded)?));
+    }
+    Ok(sinks)
 }
 
 fn cameras(args: &Args, models: &mut Models) -> anyhow::Result<Vec<CameraConfig>> {
@@ -208,7 +235,11 @@ impl Models {
 
     /// The robot that a model finds.
     fn robot(&self, place: usize) -> &str {
-        let model = self.0.get(place);
-        model.map_or("", |(_, model)| &model.description.robot)
+        self.description(place).map_or("", |of| &of.robot)
+    }
+
+    fn description(&self, place: usize) -> Option<&Description> {
+        let (_, model) = self.0.get(place)?;
+        Some(&model.description)
     }
 }

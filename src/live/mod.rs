@@ -10,8 +10,8 @@ mod frame;
 mod input;
 mod lines;
 mod mailbox;
-mod message;
 pub mod mcap;
+mod message;
 mod observation;
 mod pulse;
 mod reader;
@@ -26,7 +26,7 @@ pub use engine::{CpuEngine, Engine, GpuEngine, GpuOptions, IN_FLIGHT, OpenDevice
 pub use frame::Frame;
 pub use input::{Calibration, Input};
 pub use lines::{Lines, Named};
-pub use observation::{Event, EventKind, Observation, Rates, Sink, Statistics};
+pub use observation::{Event, EventKind, Observation, Rates, Sink, SinkError, Statistics};
 pub use source::{Location, Shot, Source, SourceError, Stream};
 pub use stop::Stop;
 pub use watch::watch;

@@ -96,6 +96,9 @@ pub struct Statistics {
     pub cameras: Vec<Rates>,
 }
 
+/// Why a sink gave up.
+pub type SinkError = Box<dyn std::error::Error + Send + Sync>;
+
 /// Where results go. Calls come from one thread, in order, and must not wait: what writes to a disk or a network has
 /// a thread and a bounded queue of its own.
 pub trait Sink: Send {
@@ -117,7 +120,7 @@ pub trait Sink: Send {
     ///
     /// # Errors
     /// Why the sink gave up, also where that was long ago and it only ignored what came since.
-    fn finish(&mut self) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+    fn finish(&mut self) -> Result<(), SinkError> {
         Ok(())
     }
 }

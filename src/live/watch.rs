@@ -9,10 +9,10 @@ use super::message::Message;
 use super::pulse::Pulse;
 use super::reader::Reader;
 use super::scheduler::Scheduler;
-use super::{Event, EventKind, Input, Sink, Statistics, Stop};
+use super::{Event, EventKind, Input, Sink, SinkError, Statistics, Stop};
 
-/// Watches cameras until `stop` is set, or all sources came to their end and all their frames are answered. `sinks`
-/// are dropped at the end.
+/// Watches cameras until `stop` is set, or all sources came to their end and all their frames are answered. Then
+/// `sinks` finish; what kept any from it is returned.
 ///
 /// Threads that cannot be stopped in time (a driver that does not return) are left behind.
 pub fn watch(
@@ -20,7 +20,7 @@ pub fn watch(
     engine: Box<dyn Engine>,
     sinks: Vec<Box<dyn Sink>>,
     stop: &Arc<Stop>,
-) {
+) -> Vec<SinkError> {
     let mailboxes = Arc::new(Mailboxes::new(inputs.len()));
     let (sender, messages) = channel();
     let robots = inputs.iter().map(|input| input.robot).collect();
@@ -44,13 +44,15 @@ pub fn watch(
         thread::spawn(move || reader.run());
     }
     drop(sender);
-    Desk {
+    let mut desk = Desk {
         sinks,
         pulses,
         mailboxes,
         ticked: Instant::now(),
-    }
-    .run(&messages, stop);
+    };
+    desk.run(&messages, stop);
+    let finished = desk.sinks.iter_mut().map(|sink| sink.finish());
+    finished.filter_map(Result::err).collect()
 }
 
 /// Where all that happens comes together, in order.
@@ -71,7 +73,7 @@ impl Desk {
     /// How long threads have to end.
     const FAREWELL: Duration = Duration::from_millis(400);
 
-    fn run(mut self, messages: &Receiver<Message>, stop: &Stop) {
+    fn run(&mut self, messages: &Receiver<Message>, stop: &Stop) {
         while !stop.is_set() {
             // A frame that came in time is not late because we are.
             for message in messages.try_iter().take(Self::MOST) {
