@@ -115,6 +115,7 @@ fn sinks(cameras: &[CameraConfig], models: &Models, stop: &Arc<Stop>) -> Vec<Box
         // The reader, such as `head`, has what it wanted.
         closed.set();
     });
+    // Every other sink is put beside it here.
     vec![Box::new(lines)]
 }
 
