@@ -49,8 +49,8 @@ pub struct GpuEngine {
     open: OpenDevice,
     models: Vec<Model>,
     options: GpuOptions,
-    /// Of each robot, the locators of each batch size, the largest first.
-    robots: Vec<Vec<BatchLocator>>,
+    /// Of each robot, the locators by their batch's size, the largest first.
+    robots: Vec<Vec<(usize, BatchLocator)>>,
     /// Robot and place of those that run a submission, the oldest first.
     under_way: VecDeque<(usize, usize)>,
 }
@@ -94,22 +94,17 @@ impl GpuEngine {
 
 impl Engine for GpuEngine {
     fn batch(&self, robot: usize, ready: usize) -> usize {
-        let fitting = BATCHES.into_iter().skip(
-            self.robots
-                .get(robot)
-                .map_or(0, |sizes| BATCHES.len() - sizes.len()),
-        );
-        fitting.into_iter().find(|&size| size <= ready).unwrap_or(1)
+        let sizes = self.robots.get(robot).into_iter().flatten();
+        let mut sizes = sizes.map(|&(size, _)| size);
+        sizes.find(|&size| size <= ready).unwrap_or(1)
     }
 
     fn submit(&mut self, robot: usize, frames: &[Frame]) -> Result<(), LocateError> {
-        let sizes = self.robots.get_mut(robot);
-        let sizes = sizes.ok_or(LocateError::Shape("robot"))?;
-        let skipped = BATCHES.len() - sizes.len();
-        let place = BATCHES.iter().position(|&size| size == frames.len());
-        let place = place.and_then(|place| place.checked_sub(skipped));
-        let locator = place.and_then(|place| sizes.get_mut(place));
-        let (Some(locator), Some(place)) = (locator, place) else {
+        let sizes = self.robots.get_mut(robot).into_iter().flatten();
+        let found = sizes
+            .enumerate()
+            .find(|(_, (size, _))| *size == frames.len());
+        let Some((place, (_, locator))) = found else {
             return Err(LocateError::Shape("batch"));
         };
         let images: Vec<BatchImage<'_>> = frames
@@ -133,7 +128,7 @@ impl Engine for GpuEngine {
         };
         let locator = self.robots.get_mut(robot).and_then(|r| r.get_mut(place));
         let finished = match locator {
-            Some(locator) => locator.finished()?,
+            Some((_, locator)) => locator.finished()?,
             None => None,
         };
         if finished.is_some() {
@@ -175,7 +170,7 @@ impl Engine for GpuEngine {
                     };
                     let mut locator = BatchLocator::new(Arc::clone(&device), model, options)?;
                     warm_up(&mut locator, batch)?;
-                    Ok(locator)
+                    Ok((batch, locator))
                 })
                 .collect::<Result<Vec<_>, LocateError>>()?;
             self.robots.push(sizes);

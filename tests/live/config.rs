@@ -101,7 +101,11 @@ fn what_is_wrong_is_told_with_file_line_and_key() {
     let cases = [
         (1, "camera: expected at least one", String::new()),
         (4, "unknown field `colour`", format!("{head}colour = 1\n")),
-        (4, "cameras: unknown field", format!("{head}[[cameras]]\n")),
+        (
+            4,
+            "[[cameras]]: unknown field `cameras`",
+            format!("{head}[[cameras]]\n"),
+        ),
         (
             1,
             "missing field `source`",

@@ -66,7 +66,7 @@ impl Judge {
 
 fn picture(red: u8, width: u32) -> RgbaImage {
     RgbaImage::from_fn(width, 48, |x, y| {
-        image::Rgba([red.wrapping_add((x + 2 * y) as u8), 3 * y as u8, 9, 255])
+        image::Rgba([128 + red / 4 + ((x + 2 * y) / 4) as u8, 3 * y as u8, 9, 255])
     })
 }
 

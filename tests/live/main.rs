@@ -4,6 +4,8 @@
 
 #[path = "../common/mod.rs"]
 mod common;
+// Its command is for programs that end by themselves.
+#[allow(dead_code)]
 #[path = "../known/mod.rs"]
 mod known;
 

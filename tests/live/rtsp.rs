@@ -21,7 +21,17 @@ impl Server {
         let sender = Command::new("ffmpeg")
             .args(["-nostdin", "-v", "error", "-re", "-f", "lavfi", "-i"])
             .arg(format!("testsrc=size={size}:rate={rate}"))
-            .args(["-c:v", "mpeg4", "-q:v", "2", "-g", "5", "-f", "rtp"])
+            .args([
+                "-c:v",
+                "mpeg4",
+                "-q:v",
+                "2",
+                "-g",
+                "5",
+                "-flags",
+                "+global_header",
+            ])
+            .args(["-f", "rtp"])
             .arg("-sdp_file")
             .arg(&sdp)
             .arg(format!("rtp://{}?pkt_size=1300", rtp.local_addr().unwrap()))
