@@ -49,13 +49,15 @@ pub struct Warning {
     pub before: Option<State>,
     /// What `state` counts as: itself, and for unknown what the rule's `unknown` says; `Unknown` where that is `ignore`.
     pub acts_as: State,
+    /// What `before` counted as.
+    pub acted_as: Option<State>,
     /// The shortest distance measured, in metres; `None` where it is unknown.
     pub distance_m: Option<f64>,
     /// What was taken off `distance_m` before it was judged, in metres.
     pub uncertainty_m: Option<f64>,
     /// Why it is unknown.
     pub why: Option<Why>,
-    /// The number of the frame that made the change; `None` where no frame did.
+    /// The number of the camera's frame that made the change; `None` where no frame did, or another camera's.
     pub frame: Option<u64>,
     /// From that frame's acquisition to the change, in milliseconds.
     pub latency_ms: Option<f64>,
