@@ -304,12 +304,18 @@ fn effect(action: &config::Action) -> Effect {
     }
 }
 
-/// A warning as JSON, with its time (seconds since 1970) and its camera.
+/// A warning as JSON, as events are written to standard output.
 fn body_of(warning: &Warning, camera: Option<&str>, at: SystemTime) -> String {
     let at = at
         .duration_since(SystemTime::UNIX_EPOCH)
         .unwrap_or_default();
-    let mut body = json!({"at": at.as_secs_f64(), "camera": camera});
+    let mut body = json!({
+        "schema": 1,
+        "type": "event",
+        "event": "warning",
+        "camera": camera,
+        "at_s": at.as_secs_f64(),
+    });
     if let (Some(body), Ok(Value::Object(fields))) =
         (body.as_object_mut(), serde_json::to_value(warning))
     {
