@@ -1,5 +1,5 @@
 use std::collections::HashSet;
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 use std::time::Duration;
 
 use serde::Deserialize;
@@ -238,7 +238,7 @@ impl ConfigError {
 fn number(
     key: &'static str,
     value: &Spanned<f64>,
-    range: Range<f64>,
+    range: RangeInclusive<f64>,
     expected: &str,
 ) -> Result<(), ConfigError> {
     let found = *value.get_ref();
@@ -319,13 +319,13 @@ impl Rule {
         number(
             "warning.stop_m",
             &self.stop_m,
-            f64::MIN_POSITIVE..f64::INFINITY,
+            f64::MIN_POSITIVE..=f64::MAX,
             metres,
         )?;
         number(
             "warning.warn_m",
             &self.warn_m,
-            f64::MIN_POSITIVE..f64::INFINITY,
+            f64::MIN_POSITIVE..=f64::MAX,
             metres,
         )?;
         let [warn_m, stop_m] = [&self.warn_m, &self.stop_m].map(|value| *value.get_ref());
@@ -341,14 +341,14 @@ impl Rule {
         number(
             "warning.hysteresis_m",
             &self.hysteresis_m,
-            0.0..f64::INFINITY,
+            0.0..=f64::MAX,
             metres,
         )?;
         if let Some(uncertainty_m) = &self.uncertainty_m {
             number(
                 "warning.uncertainty_m",
                 uncertainty_m,
-                0.0..f64::INFINITY,
+                0.0..=f64::MAX,
                 metres,
             )?;
         }
@@ -356,7 +356,7 @@ impl Rule {
         number(
             "warning.max_age_s",
             &self.max_age_s,
-            0.001..3600.0,
+            0.001..=3600.0,
             "seconds, 0.001 to 3600",
         )?;
         count("warning.agree", &self.agree)?;
@@ -462,7 +462,7 @@ impl Action {
         number(
             "action.timeout_s",
             &self.timeout_s,
-            0.01..60.0,
+            0.01..=60.0,
             "seconds, 0.01 to 60",
         )?;
         count("action.attempts", &self.attempts)?;

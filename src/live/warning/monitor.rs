@@ -208,13 +208,16 @@ impl RuleMonitor {
             before: self.told,
             acted_as: self.told.map(|before| acts_as(before, self.policy)),
             acts_as: acts_as(state, self.policy),
-            distance_m: worst.judge.distance_m().map(|m| m + worst.uncertainty_m),
+            distance_m: worst
+                .judge
+                .distance_m()
+                .map(|m| rounded(m + worst.uncertainty_m, 1e5)),
             uncertainty_m: judged.ok().map(|_| worst.uncertainty_m),
             why: judged.err(),
             frame: cause.and_then(|cause| cause.frame),
             latency_ms: cause
                 .and_then(|cause| cause.latency)
-                .map(|latency| 1e3 * latency.as_secs_f64()),
+                .map(|latency| rounded(1e3 * latency.as_secs_f64(), 1e2)),
         };
         let told = (Some(worst.camera), warning);
         self.told = Some(state);
@@ -237,6 +240,11 @@ impl View {
             Status::Invalid => Err(Why::Invalid),
         }
     }
+}
+
+/// To whole parts, so many a unit: what is printed says no more than is known.
+fn rounded(value: f64, parts: f64) -> f64 {
+    (value * parts).round() / parts
 }
 
 /// What a state counts as.
