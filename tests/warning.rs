@@ -1193,8 +1193,9 @@ impl Robot {
             commands: Arc::default(),
         };
         let (playing, commands) = (Arc::clone(&robot.playing), Arc::clone(&robot.commands));
-        let mut manners = manners.to_vec().into_iter();
+        let manners = manners.to_vec();
         thread::spawn(move || {
+            let mut manners = manners.into_iter();
             while let Ok((stream, _)) = listener.accept() {
                 let manner = manners.next().unwrap_or(Manner::Faithful);
                 let (playing, commands) = (Arc::clone(&playing), Arc::clone(&commands));

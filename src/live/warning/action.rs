@@ -95,7 +95,7 @@ pub struct Actions {
 
 impl Actions {
     /// How long pending actions may take when the program ends.
-    const FAREWELL: Duration = Duration::from_millis(500);
+    const FAREWELL: Duration = Duration::from_millis(300);
 
     /// Starts a thread an action of `config`.
     ///
@@ -151,10 +151,9 @@ impl Actions {
             worker.mailbox.changed.notify_all();
         }
     }
-}
 
-impl Drop for Actions {
-    fn drop(&mut self) {
+    /// The end: what was not tried yet is tried once, for [`Actions::FAREWELL`] at most.
+    pub fn close(&self) {
         for worker in &self.workers {
             worker.mailbox.lock().closing = true;
             worker.mailbox.changed.notify_all();
@@ -168,11 +167,9 @@ impl Drop for Actions {
                     .mailbox
                     .changed
                     .wait_timeout_while(worker.mailbox.lock(), left, at_work);
-            let (pending, timeout) = waited.unwrap_or_else(PoisonError::into_inner);
-            if timeout.timed_out() {
-                for notice in &pending.notices {
-                    log::warn!("{}: not acted on, as the program ends", notice.warning.rule);
-                }
+            let (pending, _) = waited.unwrap_or_else(PoisonError::into_inner);
+            for notice in &pending.notices {
+                log::warn!("{}: not acted on, as the program ends", notice.warning.rule);
             }
         }
     }

@@ -38,7 +38,7 @@ impl Pose {
         }
         let rotation = DQuat::from_array(rotation_xyzw);
         // Printed quaternions are rounded. What is far from a unit is something else, such as angles.
-        if !((rotation.length() - 1.0).abs() < 0.01) {
+        if !(0.99..=1.01).contains(&rotation.length()) {
             return Err(format!(
                 "rotation_xyzw: expected a quaternion of length 1, found {rotation_xyzw:?}"
             ));

@@ -93,6 +93,12 @@ impl Watch {
     }
 }
 
+impl Drop for Warnings {
+    fn drop(&mut self) {
+        self.watch.actions.close();
+    }
+}
+
 impl Sink for Warnings {
     fn observation(&mut self, observation: &Observation) {
         self.watch.judge(|monitor, now| {
