@@ -20,6 +20,7 @@ mod service;
 mod source;
 mod stop;
 mod watch;
+pub mod warning;
 
 pub use config::{CameraConfig, Config, ConfigError};
 pub use engine::{CpuEngine, Engine, GpuEngine, GpuOptions, IN_FLIGHT, OpenDevice};

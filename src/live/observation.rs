@@ -3,6 +3,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use image::RgbaImage;
 
+use super::warning::{ActionReport, Warning};
 use crate::camera::Camera;
 use crate::cascade::Estimate;
 
@@ -69,6 +70,10 @@ pub enum EventKind {
     },
     /// A device is open again.
     DeviceBack,
+    /// A warning rule's state changed; the camera is the one that changed it.
+    Warning(Warning),
+    /// An action was done for a warning, or failed.
+    Action(ActionReport),
 }
 
 /// A camera's figures over the last second.
