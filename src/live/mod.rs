@@ -19,10 +19,10 @@ mod scheduler;
 mod service;
 mod source;
 mod stop;
-mod watch;
 pub mod warning;
+mod watch;
 
-pub use config::{CameraConfig, Config, ConfigError};
+pub use config::{CameraConfig, Config, ConfigError, KnownModel};
 pub use engine::{CpuEngine, Engine, GpuEngine, GpuOptions, IN_FLIGHT, OpenDevice};
 pub use frame::Frame;
 pub use input::{Calibration, Input};

@@ -12,13 +12,15 @@ use super::scheduler::Scheduler;
 use super::{Event, EventKind, Input, Sink, SinkError, Statistics, Stop};
 
 /// Watches cameras until `stop` is set, or all sources came to their end and all their frames are answered. Then
-/// `sinks` finish; what kept any from it is returned.
+/// `sinks` finish; what kept any from it is returned. What arrives from `emitted`, where sinks send what they have to
+/// say, goes to all sinks.
 ///
 /// Threads that cannot be stopped in time (a driver that does not return) are left behind.
 pub fn watch(
     inputs: Vec<Input>,
     engine: Box<dyn Engine>,
     sinks: Vec<Box<dyn Sink>>,
+    emitted: Receiver<Event>,
     stop: &Arc<Stop>,
 ) -> Vec<SinkError> {
     let mailboxes = Arc::new(Mailboxes::new(inputs.len()));
@@ -46,11 +48,13 @@ pub fn watch(
     drop(sender);
     let mut desk = Desk {
         sinks,
+        emitted,
         pulses,
         mailboxes,
         ticked: Instant::now(),
     };
     desk.run(&messages, stop);
+    desk.pass_on();
     let finished = desk.sinks.iter_mut().map(|sink| sink.finish());
     finished.filter_map(Result::err).collect()
 }
@@ -58,6 +62,7 @@ pub fn watch(
 /// Where all that happens comes together, in order.
 struct Desk {
     sinks: Vec<Box<dyn Sink>>,
+    emitted: Receiver<Event>,
     pulses: Vec<Pulse>,
     mailboxes: Arc<Mailboxes>,
     /// When the last second was over.
@@ -81,6 +86,7 @@ impl Desk {
             }
             let now = Instant::now();
             self.look(now);
+            self.pass_on();
             match messages.recv_timeout(self.wait(now)) {
                 Ok(message) => self.handle(message),
                 Err(RecvTimeoutError::Timeout) => {}
@@ -158,6 +164,8 @@ impl Desk {
                 for sink in &mut self.sinks {
                     sink.observation(&observation);
                 }
+                // What a sink says of this answer does not wait for the next one.
+                self.pass_on();
             }
             Message::DeviceLost { reason } => self.event(None, EventKind::DeviceLost { reason }),
             Message::DeviceBack => self.event(None, EventKind::DeviceBack),
@@ -171,13 +179,24 @@ impl Desk {
     }
 
     fn event(&mut self, camera: Option<usize>, kind: EventKind) {
-        let event = Event {
+        self.tell(&Event {
             at: SystemTime::now(),
             camera,
             kind,
-        };
+        });
+        self.pass_on();
+    }
+
+    /// Tells all sinks what one of them said.
+    fn pass_on(&mut self) {
+        while let Ok(event) = self.emitted.try_recv() {
+            self.tell(&event);
+        }
+    }
+
+    fn tell(&mut self, event: &Event) {
         for sink in &mut self.sinks {
-            sink.event(&event);
+            sink.event(event);
         }
     }
 }

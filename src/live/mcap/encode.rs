@@ -19,6 +19,7 @@ use super::messages::{
 use crate::camera::Intrinsics;
 use crate::cascade::{Joint, Status};
 use crate::draw::{JOINT_COLOURS, mask_image};
+use crate::live::warning::{ActionReport, State, Warning};
 use crate::live::{Event, EventKind, Observation, Rates, Statistics};
 
 /// A camera that is recorded.
@@ -223,7 +224,14 @@ impl Encoder {
         let channel = channels.map_or(self.status, |channels| channels.status);
         out.add(channel, &DiagnosticArray { header, status })?;
 
-        if !matches!(event.kind, EventKind::Live | EventKind::DeviceBack) {
+        let blinds = matches!(
+            event.kind,
+            EventKind::Stale
+                | EventKind::Failed { .. }
+                | EventKind::Ended
+                | EventKind::DeviceLost { .. }
+        );
+        if blinds {
             let blind = match event.camera {
                 Some(_) => channels.map(std::slice::from_ref).unwrap_or_default(),
                 None => &self.cameras,
@@ -334,6 +342,8 @@ impl Channels {
 
 fn happened(name: &str, kind: &EventKind) -> DiagnosticStatus {
     let (level, message) = match kind {
+        EventKind::Warning(warning) => return warned(warning),
+        EventKind::Action(report) => return acted(report),
         EventKind::Live => (Level::Ok, "live"),
         EventKind::Stale => (Level::Stale, "stale"),
         EventKind::Failed { .. } => (Level::Error, "failed"),
@@ -358,6 +368,44 @@ fn happened(name: &str, kind: &EventKind) -> DiagnosticStatus {
         message: message.into(),
         hardware_id: name.into(),
         values,
+    }
+}
+
+fn warned(warning: &Warning) -> DiagnosticStatus {
+    let (level, message) = match warning.state {
+        State::Clear => (Level::Ok, "clear"),
+        State::Warn => (Level::Warn, "warn"),
+        State::Stop => (Level::Error, "stop"),
+        State::Unknown => (Level::Stale, "unknown"),
+    };
+    let metres = [
+        ("distance_m", warning.distance_m),
+        ("uncertainty_m", warning.uncertainty_m),
+        ("latency_ms", warning.latency_ms),
+    ];
+    let values = metres
+        .into_iter()
+        .filter_map(|(key, number)| Some(value(key, number?)));
+    DiagnosticStatus {
+        level,
+        name: format!("{}: warning", warning.rule),
+        message: message.into(),
+        hardware_id: warning.rule.clone(),
+        values: values.collect(),
+    }
+}
+
+fn acted(report: &ActionReport) -> DiagnosticStatus {
+    DiagnosticStatus {
+        level: if report.done { Level::Ok } else { Level::Error },
+        name: format!("{}: action", report.action),
+        message: report.message.clone(),
+        hardware_id: report.action.clone(),
+        values: vec![
+            value("rule", &report.rule),
+            value("attempt", report.attempt),
+            value("elapsed_ms", report.elapsed_ms),
+        ],
     }
 }
 
