@@ -15,7 +15,7 @@ use whereabot::cascade::{
     Estimate, HostLocator, HostOptions, LocateError, Located, Locator, MaskSize, Output, Source,
     Status,
 };
-use whereabot::gpu::{Device, GpuError, Planes, Yuv};
+use whereabot::gpu::{Device, GpuError, Planes, Tier, Yuv};
 use whereabot::network::{Model, Shape};
 use whereabot::reference;
 
@@ -31,16 +31,21 @@ struct Host {
 
 impl Host {
     fn new() -> Self {
-        Self::with(wgpu::Limits::default()).unwrap()
+        Self::with(wgpu::Features::empty(), wgpu::Limits::default()).unwrap()
     }
 
-    fn with(required_limits: wgpu::Limits) -> Result<Self, wgpu::RequestDeviceError> {
+    /// With `features` as far as the adapter has them.
+    fn with(
+        features: wgpu::Features,
+        required_limits: wgpu::Limits,
+    ) -> Result<Self, wgpu::RequestDeviceError> {
         let instance =
             wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle_from_env());
         let adapter = pollster::block_on(instance.request_adapter(&Default::default()))
             .expect("an adapter is needed: install mesa-vulkan-drivers");
         let (device, queue) =
             pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
+                required_features: features & adapter.features(),
                 required_limits,
                 ..Default::default()
             }))?;
@@ -281,6 +286,25 @@ fn the_answers_are_those_of_our_own_device() {
         assert!(!agree(&found.estimates[0], &other));
         let wrong = difference(&mask, &other.mask.unwrap().probability).unwrap();
         assert!(wrong > 0.02, "{wrong}");
+    }
+}
+
+#[test]
+fn what_the_host_enabled_is_used_and_none_of_it_is_needed() {
+    use wgpu::Features as F;
+    let model = model();
+    for wanted in [F::empty(), F::SUBGROUP | F::SHADER_F16 | F::PIPELINE_CACHE] {
+        let host = Host::with(wanted, wgpu::Limits::default()).unwrap();
+        let has = |feature| host.device.features().contains(feature);
+        let ours = host.ours();
+        assert_eq!(ours.tier() > Tier::Baseline, has(F::SHADER_F16));
+        assert_eq!(ours.subgroup_size().is_some(), has(F::SUBGROUP));
+        assert_eq!(ours.pipeline_cache().is_some(), has(F::PIPELINE_CACHE));
+        let mut locator = HostLocator::new(ours, &model, HostOptions::default()).unwrap();
+        let source = Source::new(host.rgba(&picture(1)), camera(WIDTH, HEIGHT));
+        locator.set_source(0, &source).unwrap();
+        let found = host.run(&mut locator);
+        assert!(agree(&found.estimates[0], &expected(&model, &picture(1))));
     }
 }
 
@@ -659,15 +683,57 @@ fn a_device_that_is_lost_at_any_stage_is_an_error_at_once() {
         let _ = host.device.poll(wgpu::PollType::wait_indefinitely());
         assert_eq!(lost.load(Ordering::SeqCst), 1, "stage {stage}");
         // Another device goes on.
-        if stage == 5 {
-            let host = Host::new();
-            let mut locator = host.locator(&model);
-            let source = Source::new(host.rgba(&picture(1)), camera(WIDTH, HEIGHT));
-            locator.set_source(0, &source).unwrap();
-            let found = host.run(&mut locator);
-            assert!(agree(&found.estimates[0], &expected(&model, &picture(1))));
-        }
+        let host = Host::new();
+        let mut locator = host.locator(&model);
+        let source = Source::new(host.rgba(&picture(1)), camera(WIDTH, HEIGHT));
+        locator.set_source(0, &source).unwrap();
+        let found = host.run(&mut locator);
+        assert!(agree(&found.estimates[0], &expected(&model, &picture(1))));
     }
+}
+
+#[test]
+fn a_device_that_was_lost_before_is_an_error_and_the_host_s_handler_sees_nothing() {
+    let host = Host::new();
+    host.device
+        .on_uncaptured_error(Arc::new(|error| panic!("the host's handler got {error}")));
+    host.device.destroy();
+    let error = Device::from_host(host.device.clone(), host.queue.clone()).unwrap_err();
+    assert!(matches!(error, GpuError::Lost(_)), "{error}");
+}
+
+#[test]
+fn a_locator_is_made_and_warmed_up_in_the_background() {
+    let (host, model) = (Host::new(), model());
+    let source = Source::new(host.rgba(&picture(1)), camera(WIDTH, HEIGHT));
+    let (ours, expected) = (host.ours(), expected(&model, &picture(1)));
+    let background = std::thread::spawn(move || {
+        let mut told = [Vec::new(), Vec::new()];
+        let [planned, ran] = &mut told;
+        let mut plan = |done, all| planned.push((done, all));
+        let options = HostOptions::default();
+        let mut locator = HostLocator::with_progress(ours, &model, options, &mut plan).unwrap();
+        locator.set_source(0, &source).unwrap();
+        locator
+            .warm_up(&mut |done, all| ran.push((done, all)))
+            .unwrap();
+        (locator, told)
+    });
+    // The host's frames go on meanwhile.
+    while !background.is_finished() {
+        host.queue.submit([]);
+    }
+    let (mut locator, told) = background.join().unwrap();
+    for told in told {
+        let (last, all) = told[told.len() - 1];
+        assert!(last == all && all > 5, "{told:?}");
+        assert!(
+            told.is_sorted_by(|a, b| a.0 < b.0 && a.1 == b.1),
+            "{told:?}"
+        );
+    }
+    let found = host.run(&mut locator);
+    assert!(agree(&found.estimates[0], &expected));
 }
 
 #[test]
@@ -705,6 +771,10 @@ fn what_cannot_be_read_is_refused_in_words() {
                 U::COPY_DST,
             ))),
             "TEXTURE_BINDING",
+        ),
+        (
+            Source::new(Host::new().rgba(&picture(1)), ours),
+            "another device",
         ),
         (nv12(&right, &luma), "luma"),
         (nv12(&luma, &luma), "chroma"),
@@ -755,7 +825,8 @@ fn what_cannot_be_read_is_refused_in_words() {
 
 #[test]
 fn a_device_that_lacks_a_limit_is_refused_in_words() {
-    let host = Host::with(wgpu::Limits::downlevel_webgl2_defaults()).unwrap();
+    let limits = wgpu::Limits::downlevel_webgl2_defaults();
+    let host = Host::with(wgpu::Features::empty(), limits).unwrap();
     let error = Device::from_host(host.device, host.queue).unwrap_err();
     assert!(matches!(error, GpuError::Limit { .. }), "{error}");
 }

@@ -230,6 +230,18 @@ fn a_gpu_that_fails_gives_an_error_and_no_answer() {
     let locate = "const source = await createImageBitmap(new ImageData(64, 64));
                   return await engine.locate(source, 64, 64, 70).then(JSON.stringify, String)";
 
+    // A browser without an adapter: no GPU is made up, and where none is insisted on, plain Rust runs.
+    bench.go("empty");
+    let open = "GPU.prototype.requestAdapter = async () => null;
+                const { open } = await import('/engine.js');
+                const canvas = document.createElement('canvas')";
+    let wanted = format!("{open}; return await open(canvas, 'gpu').then(JSON.stringify, String)");
+    let either = format!("{open}; return (await open(canvas)).why");
+    for script in [wanted, either] {
+        let answer = bench.page.run(&script);
+        assert!(answer.as_str().unwrap().contains("no adapter"), "{answer}");
+    }
+
     // A browser that does not understand a kernel.
     bench.go("empty");
     bench.page.run(
