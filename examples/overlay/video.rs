@@ -1,7 +1,7 @@
 //! A video's frames at its own pace, decoded by the program `ffmpeg`.
 
 use std::error::Error;
-use std::io::{BufRead, BufReader, ErrorKind, Read};
+use std::io::{BufRead, BufReader, ErrorKind};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, TryRecvError, TrySendError, sync_channel};

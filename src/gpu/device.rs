@@ -136,7 +136,8 @@ impl Device {
     /// it; nothing is submitted but by calls that say so.
     ///
     /// # Errors
-    /// [`GpuError::Limit`] where the device has less than WebGPU's defaults of what every kernel needs.
+    /// [`GpuError::Limit`] where the device has less than WebGPU's defaults of what every kernel needs, and
+    /// [`GpuError::Lost`].
     pub fn from_host(device: wgpu::Device, queue: wgpu::Queue) -> Result<Self, GpuError> {
         let host = Self {
             tier: Tier::with(device.features()),
@@ -155,6 +156,7 @@ impl Device {
         for (what, needed, allowed) in adapter::needs(&limits) {
             host.require(what, needed.into(), allowed.into())?;
         }
+        host.check()?;
         Ok(host)
     }
 
