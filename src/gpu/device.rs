@@ -152,11 +152,22 @@ impl Device {
             device,
             queue,
         };
+        #[cfg(not(target_arch = "wasm32"))]
+        {
+            // A device that was lost before made a buffer that is not valid: of that the host's handler would
+            // hear.
+            let scope = host.device.push_error_scope(wgpu::ErrorFilter::Validation);
+            let checked = host.check();
+            let refused = pollster::block_on(scope.pop());
+            checked?;
+            if let Some(error) = refused {
+                return Err(convert(error));
+            }
+        }
         let limits = host.device.limits();
         for (what, needed, allowed) in adapter::needs(&limits) {
             host.require(what, needed.into(), allowed.into())?;
         }
-        host.check()?;
         Ok(host)
     }
 
