@@ -78,7 +78,8 @@ pub struct Rates {
     pub frames_per_s: f64,
     /// Answers, a second.
     pub answers_per_s: f64,
-    /// Frames that were replaced by newer ones before they were searched, since the start.
+    /// Frames that got no answer, since the start: replaced by newer ones before they were searched, or under way
+    /// when a device was lost.
     pub dropped: u64,
     /// Median of the answers' ages.
     pub age_p50: Option<Duration>,
@@ -106,4 +107,9 @@ pub trait Sink: Send {
 
     /// A second is over.
     fn statistics(&mut self, statistics: &Statistics);
+
+    /// Whether it needs the masks of the estimates, which are read back only then.
+    fn wants_masks(&self) -> bool {
+        false
+    }
 }
