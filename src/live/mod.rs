@@ -5,5 +5,6 @@
 //! goes to every [`Sink`] as an [`Observation`].
 
 mod observation;
+pub mod page;
 
 pub use observation::{Event, EventKind, Observation, Rates, Sink, Statistics};

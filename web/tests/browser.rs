@@ -3,6 +3,7 @@
 #![cfg(not(target_arch = "wasm32"))]
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing)]
 
+#[path = "../../tests/chromium/mod.rs"]
 mod chromium;
 mod server;
 
@@ -41,7 +42,7 @@ impl Bench {
         let frames = ["ur5_1", "ur5_2", "ur5_3"].map(|name| std::fs::read(picture(name)).unwrap());
         std::fs::write(&webcam, frames.concat()).unwrap();
         let address = server::serve(vec![dist.into(), files.path().into()]);
-        let page = Page::open(&webcam);
+        let page = Page::open(Some(&webcam));
         Self {
             page,
             address,

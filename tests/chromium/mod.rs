@@ -26,8 +26,9 @@ impl Page {
     /// WebGPU in software takes seconds for a picture, and more on a busy machine.
     const PATIENCE: Duration = Duration::from_secs(240);
 
-    /// Opens a page on nothing, with WebGPU and a webcam that plays `webcam`, a file of JPEG pictures.
-    pub fn open(webcam: &Path) -> Self {
+    /// Opens a page on nothing, with WebGPU and, where it is given, a webcam that plays `webcam`, a file of JPEG
+    /// pictures.
+    pub fn open(webcam: Option<&Path>) -> Self {
         let chromium = std::env::var("CHROMIUM").unwrap_or_else(|_| "chromium".into());
         let profile = tempfile::tempdir().unwrap();
         // The protocol is on file descriptors 3 and 4.
@@ -49,10 +50,9 @@ impl Page {
                 "--use-fake-device-for-media-stream",
                 "--use-fake-ui-for-media-stream",
             ])
-            .arg(format!(
-                "--use-file-for-fake-video-capture={}",
-                webcam.display()
-            ))
+            .args(
+                webcam.map(|file| format!("--use-file-for-fake-video-capture={}", file.display())),
+            )
             .arg(format!("--user-data-dir={}", profile.path().display()))
             .args([
                 "--no-first-run",
