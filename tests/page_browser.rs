@@ -441,7 +441,7 @@ fn a_phone_and_a_keyboard_reach_everything() {
     save_screenshot(&mut page, "watch-phone-space");
 
     // From the top with the tab key: sound, pause, the four cameras, the selector, space.
-    let mut press = |page: &mut Page, key: &str, code: u32, text: &str| {
+    let press = |page: &mut Page, key: &str, code: u32, text: &str| {
         for kind in ["keyDown", "keyUp"] {
             let event = json!({"type": kind, "key": key, "windowsVirtualKeyCode": code, "text": if kind == "keyDown" { text } else { "" }});
             page.call("Input.dispatchKeyEvent", event);

@@ -30,7 +30,7 @@ const HTML: &str = "text/html; charset=utf-8";
 const JAVASCRIPT: &str = "text/javascript; charset=utf-8";
 
 /// By the paths that they are asked for.
-const FILES: [(&str, &str, &str); 5] = [
+static FILES: [(&str, &str, &str); 5] = [
     ("", HTML, include_str!("index.html")),
     (
         "style.css",

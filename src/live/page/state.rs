@@ -20,8 +20,6 @@ const LONGEST_WAIT: Duration = Duration::from_secs(1);
 const WATCHED: Duration = Duration::from_secs(3);
 /// The events that are kept for those who come later.
 const MOST_EVENTS: usize = 100;
-/// The rules whose alarms are kept.
-const MOST_ALARMS: usize = 1000;
 /// Characters of an event's reason.
 const LONGEST_REASON: usize = 300;
 
@@ -210,9 +208,6 @@ impl Board {
     pub fn alarm(&self, alarm: Alarm) {
         let mut state = self.lock();
         let known = state.alarms.get(&alarm.rule);
-        if known.is_none() && state.alarms.len() >= MOST_ALARMS {
-            return;
-        }
         if known.is_none_or(|known| known.state != alarm.state) {
             let Alarm { rule, reason, .. } = &alarm;
             let reason = reason.as_deref().map(|reason| format!(": {reason}"));
@@ -495,4 +490,105 @@ fn milliseconds(at: SystemTime) -> u64 {
 
 fn to_milliseconds(duration: Duration) -> f64 {
     1e3 * duration.as_secs_f64()
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::indexing_slicing)]
+mod tests {
+    use image::RgbaImage;
+    use serde_json::{Value, json};
+
+    use super::*;
+    use crate::camera::Camera;
+    use crate::cascade::Estimate;
+
+    fn board() -> Board {
+        Board::new(vec![CameraInfo {
+            name: "bench".into(),
+            robot: "ur5".into(),
+            canonical: Camera::from_hfov(4, 4, 1.0).intrinsics,
+            common_from_camera: None,
+        }])
+    }
+
+    fn observation(frame: u64) -> Observation {
+        Observation {
+            camera: 0,
+            frame,
+            acquired: SystemTime::now(),
+            acquired_at: Instant::now(),
+            answered_at: Instant::now(),
+            image: Arc::new(RgbaImage::new(4, 4)),
+            view: Camera::from_hfov(4, 4, 1.0),
+            estimate: Estimate {
+                status: Status::NotFound,
+                coverage: 0.0,
+                bbox_px: None,
+                field: 1.0,
+                joints: Vec::new(),
+                mask: None,
+            },
+        }
+    }
+
+    /// The frames that a client that knows nothing gets.
+    fn frames(board: &Board) -> Vec<Value> {
+        let parts = board.changes_since(0);
+        let message: Value = serde_json::from_slice(&parts[0][4..]).unwrap();
+        let tiles = message["tiles"].as_array().unwrap();
+        tiles.iter().map(|tile| tile["frame"].clone()).collect()
+    }
+
+    #[test]
+    fn pictures_are_encoded_only_while_somebody_watches() {
+        let board = Arc::new(board());
+        let painter = board.clone();
+        let painter = std::thread::spawn(move || painter.paint());
+        board.observe(&observation(0));
+        std::thread::sleep(Duration::from_millis(300));
+        assert!(board.lock().views[0].painted.is_none());
+        let start = Instant::now();
+        while frames(&board) != [json!(0)] {
+            assert!(start.elapsed() < Duration::from_secs(30));
+        }
+        board.close();
+        painter.join().unwrap();
+    }
+
+    #[test]
+    fn who_comes_later_sees_no_picture_of_before() {
+        let board = Arc::new(board());
+        let painter = board.clone();
+        let painter = std::thread::spawn(move || painter.paint());
+        board.observe(&observation(0));
+        while frames(&board) != [json!(0)] {}
+        board.close();
+        painter.join().unwrap();
+
+        // Nobody watches for a while, and nothing new comes: the last picture is still the newest.
+        board.lock().asked_at = None;
+        assert_eq!(frames(&board), [json!(0)]);
+        board.lock().asked_at = None;
+        board.observe(&observation(1));
+        assert!(frames(&board).is_empty());
+    }
+
+    #[test]
+    fn events_that_are_kept_have_a_bound() {
+        let board = board();
+        let at = SystemTime::now();
+        for _ in 0..1000 {
+            let reason = "a".repeat(10_000);
+            let kind = EventKind::DeviceLost { reason };
+            board.tell(&Event {
+                at,
+                camera: None,
+                kind,
+            });
+        }
+        let state = board.lock();
+        assert_eq!(state.events.len(), MOST_EVENTS);
+        let longest = state.events.iter().map(|(_, event)| event.text.len()).max();
+        assert!(longest.unwrap() <= LONGEST_REASON);
+    }
 }
