@@ -231,7 +231,7 @@ const COUNTERS: &str = "
     document.addEventListener('securitypolicyviolation', ({ blockedURI }) => counts.violations.push(blockedURI));";
 
 fn open(program: &Program, width: u32, height: u32, scale: u32, theme: &str) -> Page {
-    let mut page = Page::open(None);
+    let mut page = Page::open(&["--disable-gpu"]);
     page.call(
         "Page.addScriptToEvaluateOnNewDocument",
         json!({"source": COUNTERS}),
@@ -377,10 +377,10 @@ fn a_pause_stops_the_traffic_and_a_lost_program_is_never_clear() {
     page.run("document.getElementById('sound').click()");
     page.wait_until("counts.tones > 2");
 
+    page.wait_until("counts.asked > 5");
     page.run("document.getElementById('pause').click()");
     std::thread::sleep(Duration::from_millis(300));
     let asked = page.run("return counts.asked").as_u64().unwrap();
-    assert!(asked > 5);
     let tones = page.run("return counts.tones");
     std::thread::sleep(Duration::from_millis(1500));
     assert_eq!(page.run("return counts.asked"), asked);
