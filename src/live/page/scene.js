@@ -130,7 +130,7 @@ export class Space {
           return [radius * Math.cos(angle), floor, radius * Math.sin(angle)];
         });
         stroke(ring, line, 1.2);
-        write(`${radius} m`, [-0.6 * radius, floor, -0.8 * radius], faint);
+        write(`${radius} m`, [0.3 * radius, floor, -0.95 * radius], faint);
       }
     } else {
       for (let at = -2; at <= 2; at += 0.5) {
