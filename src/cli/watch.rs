@@ -1,6 +1,6 @@
 //! `whereabot watch`: finds the robots in the frames of many cameras, live.
 
-use std::io;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -18,6 +18,7 @@ use super::weights;
 use crate::camera::Camera;
 use crate::gpu::{Device, GpuError};
 use crate::live::mcap::{RecordedCamera, Recorder};
+use crate::live::page::{self, CameraInfo};
 use crate::live::warning::{Warnings, uncertainty_m};
 use crate::live::{
     Calibration, CameraConfig, Config, CpuEngine, Engine, Event, GpuEngine, GpuOptions, KnownModel,
@@ -56,6 +57,9 @@ pub struct Args {
     /// A new file for what the cameras saw and what was found: MCAP, ROS 2 messages
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
+    /// A page of all cameras, at HOST:PORT, for a browser; on an address that other machines reach it has a token
+    #[arg(long, value_name = "ADDRESS")]
+    serve: Option<String>,
     /// What to store activations in; f16 is for GPUs
     #[arg(long, value_enum, value_name = "NAME", default_value = "f32")]
     precision: PrecisionName,
@@ -82,7 +86,10 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
     }
     let stop = Arc::new(Stop::default());
     let (emit, emitted) = mpsc::channel();
-    let sinks = sinks(&args, &config, &models, emit, &stop)?;
+    let mut sinks = sinks(&args, &config, &models, emit, &stop)?;
+    // Open until the end.
+    let page = page(&args, cameras, &models)?;
+    sinks.extend(page.iter().map(|page| Box::new(page.sink()) as _));
     let mask = sinks.iter().any(|sink| sink.wants_masks());
     let engine = engine(args, models, cameras.len(), mask)?;
     stop_on_signals(&stop).context("signals cannot be handled")?;
@@ -159,6 +166,30 @@ fn sinks(
         sinks.push(Box::new(Recorder::create(file, &recorded)?));
     }
     Ok(sinks)
+}
+
+/// The page, where there is to be one.
+fn page(
+    args: &Args,
+    cameras: &[CameraConfig],
+    models: &Models,
+) -> anyhow::Result<Option<page::Server>> {
+    let Some(address) = &args.serve else {
+        return Ok(None);
+    };
+    let shown = cameras.iter().map(|camera| {
+        let description = models.description(camera.robot.place)?;
+        Some(CameraInfo {
+            name: camera.name.clone(),
+            robot: description.robot.clone(),
+            canonical: description.camera,
+            common_from_camera: camera.world_from_camera.map(|pose| pose.matrix()),
+        })
+    });
+    let server = page::Server::bind(address, shown.flatten().collect())?;
+    // Not a log line: who filters those needs it, too.
+    writeln!(io::stderr(), "the page: {}", server.url())?;
+    Ok(Some(server))
 }
 
 fn config(args: &Args, models: &mut Models) -> anyhow::Result<Config> {

@@ -13,6 +13,7 @@ mod mailbox;
 pub mod mcap;
 mod message;
 mod observation;
+pub mod page;
 mod pulse;
 mod reader;
 mod scheduler;

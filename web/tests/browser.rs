@@ -3,6 +3,7 @@
 #![cfg(not(target_arch = "wasm32"))]
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing)]
 
+#[path = "../../tests/chromium/mod.rs"]
 mod chromium;
 mod server;
 
@@ -41,7 +42,18 @@ impl Bench {
         let frames = ["ur5_1", "ur5_2", "ur5_3"].map(|name| std::fs::read(picture(name)).unwrap());
         std::fs::write(&webcam, frames.concat()).unwrap();
         let address = server::serve(vec![files.path().into(), dist.into()]);
-        let page = Page::open(&webcam);
+        let webcam = format!("--use-file-for-fake-video-capture={}", webcam.display());
+        let page = Page::open(&[
+            "--enable-unsafe-webgpu",
+            "--use-webgpu-adapter=swiftshader",
+            // With these, videos go to textures and WebGPU to canvases; else the GPU process falls.
+            "--enable-features=Vulkan",
+            "--use-vulkan=swiftshader",
+            "--use-angle=swiftshader",
+            "--use-fake-device-for-media-stream",
+            "--use-fake-ui-for-media-stream",
+            &webcam,
+        ]);
         Self {
             page,
             address,

@@ -1,4 +1,4 @@
-use glam::{DQuat, DVec3};
+use glam::{DMat4, DQuat, DVec3};
 use serde::Deserialize;
 
 /// Where a camera is: from its optical frame (REP 103: x right, y down, z forward) to the common frame.
@@ -52,6 +52,12 @@ impl Pose {
     /// A point of the camera's frame in the common frame, in metres.
     pub fn world_from_camera(&self, point: [f64; 3]) -> [f64; 3] {
         (self.rotation * DVec3::from(point) + self.translation).to_array()
+    }
+
+    /// The same as a matrix, row by row.
+    pub fn matrix(&self) -> [[f64; 4]; 4] {
+        let matrix = DMat4::from_rotation_translation(self.rotation, self.translation);
+        matrix.transpose().to_cols_array_2d()
     }
 
     /// The translation, in metres.

@@ -1,7 +1,6 @@
 //! A headless Chromium, driven by its DevTools protocol over a pipe.
 
 use std::io::{BufRead, BufReader, Write};
-use std::path::Path;
 use std::process::{Child, ChildStdin, Command, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
@@ -23,11 +22,11 @@ pub struct Page {
 }
 
 impl Page {
-    /// WebGPU in software takes seconds for a picture, and more on a busy machine.
+    /// WebGPU in software takes seconds for a picture, and everything takes more on a busy machine.
     const PATIENCE: Duration = Duration::from_secs(240);
 
-    /// Opens a page on nothing, with WebGPU and a webcam that plays `webcam`, a file of JPEG pictures.
-    pub fn open(webcam: &Path) -> Self {
+    /// Opens a page on nothing, in a Chromium with more `flags`.
+    pub fn open(flags: &[&str]) -> Self {
         let chromium = std::env::var("CHROMIUM").unwrap_or_else(|_| "chromium".into());
         let profile = tempfile::tempdir().unwrap();
         // The protocol is on file descriptors 3 and 4.
@@ -38,21 +37,7 @@ impl Page {
                 &chromium,
             ])
             .args(["--headless=new", "--no-sandbox", "--remote-debugging-pipe"])
-            .args(["--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"])
-            // With these, videos go to textures and WebGPU to canvases; else the GPU process falls.
-            .args([
-                "--enable-features=Vulkan",
-                "--use-vulkan=swiftshader",
-                "--use-angle=swiftshader",
-            ])
-            .args([
-                "--use-fake-device-for-media-stream",
-                "--use-fake-ui-for-media-stream",
-            ])
-            .arg(format!(
-                "--use-file-for-fake-video-capture={}",
-                webcam.display()
-            ))
+            .args(flags)
             .arg(format!("--user-data-dir={}", profile.path().display()))
             .args([
                 "--no-first-run",
