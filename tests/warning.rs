@@ -1135,6 +1135,26 @@ fn a_newer_state_takes_an_older_one_s_place_and_nobody_waits() {
     assert_eq!(tried, [(State::Unknown, 1, false), (State::Stop, 1, true)]);
 }
 
+/// Unknown that counts as a warning and a warning are one to who acts on warnings.
+#[test]
+fn what_is_acted_on_already_is_not_acted_on_again() {
+    let (url, requests) = http(vec![OK; 3], None);
+    let mut running = Running::new(&format!(
+        "[[action]]\nname = \"post\"\non = [\"warn\"]\npost = \"{url}\"\ntimeout_s = 20\n"
+    ));
+    let next = || requests.recv_timeout(20 * SECOND).unwrap().1;
+    assert_eq!(next()["state"], "unknown");
+    running.see(1.5);
+    assert!(running.report().done);
+    running.see(0.5);
+    running.see(1.5);
+    let body = next();
+    assert_eq!(
+        (&body["before"], &body["state"]),
+        (&json!("stop"), &json!("warn"))
+    );
+}
+
 #[test]
 fn the_end_does_not_wait_for_who_never_answers() {
     let (url, requests) = http(vec![""; 2], None);
