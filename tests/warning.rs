@@ -495,7 +495,7 @@ fn a_rule_tells_what_it_knows_and_how_late() {
             distance_m: Some(2.5),
             uncertainty_m: Some(0.1),
             why: None,
-            frame: Some(1),
+            frame_number: Some(1),
             latency_ms: Some(30.0),
         }
     );
