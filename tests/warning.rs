@@ -495,7 +495,7 @@ fn a_rule_tells_what_it_knows_and_how_late() {
             distance_m: Some(2.5),
             uncertainty_m: Some(0.1),
             why: None,
-            frame: Some(1),
+            frame_number: Some(1),
             latency_ms: Some(30.0),
         }
     );
@@ -1133,6 +1133,26 @@ fn a_newer_state_takes_an_older_one_s_place_and_nobody_waits() {
     let tried = [running.report(), running.report()];
     let tried = tried.map(|report| (report.state, report.attempt, report.done));
     assert_eq!(tried, [(State::Unknown, 1, false), (State::Stop, 1, true)]);
+}
+
+/// Unknown that counts as a warning and a warning are one to who acts on warnings.
+#[test]
+fn what_is_acted_on_already_is_not_acted_on_again() {
+    let (url, requests) = http(vec![OK; 3], None);
+    let mut running = Running::new(&format!(
+        "[[action]]\nname = \"post\"\non = [\"warn\"]\npost = \"{url}\"\ntimeout_s = 20\n"
+    ));
+    let next = || requests.recv_timeout(20 * SECOND).unwrap().1;
+    assert_eq!(next()["state"], "unknown");
+    running.see(1.5);
+    assert!(running.report().done);
+    running.see(0.5);
+    running.see(1.5);
+    let body = next();
+    assert_eq!(
+        (&body["before"], &body["state"]),
+        (&json!("stop"), &json!("warn"))
+    );
 }
 
 #[test]

@@ -214,7 +214,7 @@ impl RuleMonitor {
                 .map(|m| rounded(m + worst.uncertainty_m, 1e5)),
             uncertainty_m: judged.ok().map(|_| worst.uncertainty_m),
             why: judged.err(),
-            frame: cause.and_then(|cause| cause.frame),
+            frame_number: cause.and_then(|cause| cause.frame),
             latency_ms: cause
                 .and_then(|cause| cause.latency)
                 .map(|latency| rounded(1e3 * latency.as_secs_f64(), 1e2)),

@@ -58,7 +58,7 @@ pub struct Warning {
     /// Why it is unknown.
     pub why: Option<Why>,
     /// The number of the camera's frame that made the change; `None` where no frame did, or another camera's.
-    pub frame: Option<u64>,
+    pub frame_number: Option<u64>,
     /// From that frame's acquisition to the change, in milliseconds.
     pub latency_ms: Option<f64>,
 }
