@@ -1,6 +1,7 @@
 //! The examples do what their READMEs say. Cargo builds them with the tests.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
 
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
@@ -91,16 +92,20 @@ impl Screen {
 
     fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
-        // Displays below a hundred are people's.
-        let display = format!(":{}", 100 + std::process::id() % 10_000);
         let [width, height] = Self::SIZE;
-        let server = Command::new("Xvfb")
-            .args([&display, "-screen", "0", &format!("{width}x{height}x24")])
-            .args(["-nolisten", "tcp", "-fbdir"])
+        let mut server = Command::new("Xvfb")
+            .args(["-displayfd", "1", "-nolisten", "tcp"])
+            .args(["-screen", "0", &format!("{width}x{height}x24"), "-fbdir"])
             .arg(folder.path())
+            .stdout(Stdio::piped())
             .stderr(Stdio::null())
             .spawn()
-            .expect("Xvfb is needed: scripts/install --test installs it");
+            .expect("Xvfb is needed: scripts/install --tests installs it");
+        // It finds a free display, and says which once it is ready.
+        let mut number = String::new();
+        let output = server.stdout.as_mut().unwrap();
+        BufReader::new(output).read_line(&mut number).unwrap();
+        let display = format!(":{}", number.trim());
         Self {
             server,
             display,
@@ -195,43 +200,46 @@ fn off(screen: &RgbImage, expected: &[Option<[f32; 3]>], width: u32) -> f32 {
     sum.0 / sum.1 as f32
 }
 
+/// What the overlay's window shows when it plays `source`, once that is within `bound` of `wanted`.
+fn played(source: &Path, wanted: &[Option<[f32; 3]>], width: u32, bound: f32) -> RgbImage {
+    let screen = Screen::new();
+    let mut window = example("overlay")
+        .arg(source)
+        .env("DISPLAY", &screen.display)
+        .env_remove("WAYLAND_DISPLAY")
+        .spawn()
+        .unwrap();
+    let start = Instant::now();
+    let picture = loop {
+        let picture = screen.picture();
+        let found = picture.as_ref().map(|p| off(p, wanted, width));
+        if let Some(status) = window.try_wait().unwrap() {
+            panic!("the window closed: {status}");
+        }
+        if found.is_some_and(|found| found < bound) {
+            break picture.unwrap();
+        }
+        assert!(start.elapsed() < Duration::from_secs(120), "{found:?}");
+        std::thread::sleep(Duration::from_millis(200));
+    };
+    let _ = window.kill();
+    let _ = window.wait();
+    picture
+}
+
 #[test]
 fn overlay_shows_mask_and_joints_in_its_window() {
     let folder = tempfile::tempdir().unwrap();
     for name in ["ur5_1.jpg", "camera_info.yaml"] {
         std::fs::copy(Path::new(IMAGES).join(name), folder.path().join(name)).unwrap();
     }
-    let screen = Screen::new();
-    std::thread::sleep(Duration::from_secs(1));
-    let mut window = example("overlay")
-        .arg(folder.path())
-        .env("DISPLAY", &screen.display)
-        .env_remove("WAYLAND_DISPLAY")
-        .spawn()
-        .unwrap();
-
     let model = Model::load(WEIGHTS).unwrap();
     let shown = bundled("ur5_1.jpg");
     let width = shown.0.width();
     let estimate = located(&model, &shown.0, &shown.1);
     assert_eq!(estimate.status, Status::Found);
     let wanted = expected(&model, &shown, &estimate, true);
-    let start = Instant::now();
-    let picture = loop {
-        if let Some(picture) = screen.picture()
-            && off(&picture, &wanted, width) < 0.004
-        {
-            break picture;
-        }
-        if let Some(status) = window.try_wait().unwrap() {
-            panic!("the window closed: {status}");
-        }
-        let found = screen.picture().map(|p| off(&p, &wanted, width));
-        assert!(start.elapsed() < Duration::from_secs(120), "{found:?}");
-        std::thread::sleep(Duration::from_millis(200));
-    };
-    let _ = window.kill();
-    let _ = window.wait();
+    let picture = played(folder.path(), &wanted, width, 0.004);
 
     // Negative controls: without the tint, and another picture.
     let plain = expected(&model, &shown, &estimate, false);
@@ -266,13 +274,45 @@ fn overlay_shows_mask_and_joints_in_its_window() {
 }
 
 #[test]
+fn overlay_plays_a_video() {
+    let folder = tempfile::tempdir().unwrap();
+    let camera = folder.path().join("camera_info.yaml");
+    std::fs::copy(Path::new(IMAGES).join("camera_info.yaml"), camera).unwrap();
+    // Two seconds of one picture, then two of another, which the window has to come to.
+    let second = |name| {
+        std::fs::read(Path::new(IMAGES).join(name))
+            .unwrap()
+            .repeat(50)
+    };
+    let video = folder.path().join("video.mjpeg");
+    std::fs::write(&video, [second("ur5_2.jpg"), second("ur5_1.jpg")].concat()).unwrap();
+
+    let model = Model::load(WEIGHTS).unwrap();
+    let shown = bundled("ur5_1.jpg");
+    let width = shown.0.width();
+    let estimate = located(&model, &shown.0, &shown.1);
+    let wanted = expected(&model, &shown, &estimate, true);
+    // ffmpeg's decoder makes other colours of the same JPEG, by a step or two.
+    let picture = played(&video, &wanted, width, 0.015);
+    // Negative control: without the tint.
+    let plain = expected(&model, &shown, &estimate, false);
+    let [right, untinted] = [&wanted, &plain].map(|wanted| off(&picture, wanted, width));
+    assert!(untinted > 1.5 * right, "{untinted} {right}");
+}
+
+#[test]
 fn overlay_says_what_is_wrong() {
     let empty = tempfile::tempdir().unwrap();
-    for (folder, word) in [
-        ("nowhere", "nowhere"),
-        (empty.path().to_str().unwrap(), "no images"),
+    let empty = empty.path().to_str().unwrap();
+    let path = std::env::var("PATH").unwrap();
+    for (source, path, word) in [
+        ("nowhere", path.as_str(), "nowhere"),
+        (empty, &path, "no images"),
+        (WEIGHTS, &path, "ffmpeg gives no more frames"),
+        (WEIGHTS, empty, "ffmpeg plays videos, and is not installed"),
     ] {
-        let output = example("overlay").arg(folder).output().unwrap();
+        let output = example("overlay").arg(source).env("PATH", path).output();
+        let output = output.unwrap();
         let text = String::from_utf8(output.stderr).unwrap();
         assert!(!output.status.success() && text.contains(word), "{text}");
     }

@@ -1,14 +1,15 @@
 //! A window that shows a camera's pictures, the robot's mask over them and its joints as spheres: one
 //! device, one submission a frame, and no picture that leaves the GPU.
 //!
-//! `cargo run --release --example overlay [-- FOLDER [WEIGHTS]]`
+//! `cargo run --release --example overlay [-- FOLDER|VIDEO [WEIGHTS]]`
 
 mod pictures;
 mod scene;
+mod video;
 
 use std::error::Error;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use pictures::Pictures;
 use scene::Scene;
@@ -18,9 +19,6 @@ use winit::dpi::LogicalSize;
 use winit::event::WindowEvent;
 use winit::event_loop::{ActiveEventLoop, EventLoop};
 use winit::window::{Window, WindowId};
-
-/// How long a picture stays.
-const PACE: Duration = Duration::from_millis(700);
 
 struct Application {
     model: Model,
@@ -32,7 +30,6 @@ struct Application {
 struct Running {
     window: Arc<Window>,
     scene: Scene,
-    next_picture: Instant,
     last_frame: Instant,
     /// A running mean, in milliseconds.
     frame_ms: f64,
@@ -50,7 +47,6 @@ impl Application {
         Ok(Running {
             window,
             scene,
-            next_picture: Instant::now(),
             last_frame: Instant::now(),
             frame_ms: 0.0,
         })
@@ -60,10 +56,8 @@ impl Application {
         let Some(running) = &mut self.running else {
             return Ok(());
         };
-        if Instant::now() >= running.next_picture {
-            let (picture, camera) = self.pictures.next()?;
+        if let Some((picture, camera)) = self.pictures.next()? {
             running.scene.show(&picture, &camera)?;
-            running.next_picture = Instant::now() + PACE;
         }
         running.scene.draw(&running.window)?;
         let now = Instant::now();
@@ -118,13 +112,13 @@ impl ApplicationHandler for Application {
 
 fn main() -> Result<(), Box<dyn Error>> {
     let mut arguments = std::env::args().skip(1);
-    let folder = arguments.next().unwrap_or("examples/images".to_owned());
+    let pictures = arguments.next().unwrap_or("examples/images".to_owned());
     let weights = arguments
         .next()
         .unwrap_or("weights/ur5.safetensors".to_owned());
     let mut application = Application {
         model: Model::load(weights)?,
-        pictures: Pictures::open(folder.as_ref())?,
+        pictures: Pictures::open(pictures.as_ref())?,
         running: None,
         failure: None,
     };

@@ -59,7 +59,7 @@ impl Report {
 pub struct Program {
     /// Its version.
     pub version: String,
-    /// Architecture and operating system.
+    /// Architecture and operating system; in a browser, which does not tell it, the former alone.
     pub target: String,
     /// Built without release optimisation: slower in plain Rust.
     pub debug: bool,
@@ -67,9 +67,10 @@ pub struct Program {
 
 impl Program {
     pub(crate) fn this() -> Self {
+        use std::env::consts::{ARCH, OS};
         Self {
             version: env!("CARGO_PKG_VERSION").to_owned(),
-            target: format!("{}-{}", std::env::consts::ARCH, std::env::consts::OS),
+            target: [ARCH, OS].join("-").trim_end_matches('-').to_owned(),
             debug: cfg!(debug_assertions),
         }
     }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{self, Sender};
 use std::thread;
 use std::time::Duration;
 
@@ -16,11 +17,13 @@ use super::locate::field_of_view;
 use super::weights;
 use crate::camera::Camera;
 use crate::gpu::{Device, GpuError};
+use crate::live::mcap::{RecordedCamera, Recorder};
+use crate::live::warning::{Warnings, uncertainty_m};
 use crate::live::{
-    Calibration, CameraConfig, Config, CpuEngine, Engine, GpuEngine, GpuOptions, Lines, Location,
-    Named, Sink, Stop, watch,
+    Calibration, CameraConfig, Config, CpuEngine, Engine, Event, GpuEngine, GpuOptions, KnownModel,
+    Lines, Location, Named, Sink, Stop, watch,
 };
-use crate::network::Model;
+use crate::network::{Description, Model};
 
 /// Find the robots in the frames of many cameras, live
 ///
@@ -50,6 +53,9 @@ pub struct Args {
     /// With --source: the cameras' horizontal field of view
     #[arg(long, value_name = "DEGREES", value_parser = field_of_view, conflicts_with = "config")]
     hfov: Option<f64>,
+    /// A new file for what the cameras saw and what was found: MCAP, ROS 2 messages
+    #[arg(long, value_name = "FILE")]
+    record: Option<PathBuf>,
     /// What to store activations in; f16 is for GPUs
     #[arg(long, value_enum, value_name = "NAME", default_value = "f32")]
     precision: PrecisionName,
@@ -60,8 +66,9 @@ pub struct Args {
 /// Runs the command.
 pub fn run(args: Args) -> anyhow::Result<ExitCode> {
     let mut models = Models::default();
-    let cameras = cameras(&args, &mut models)?;
-    for camera in &cameras {
+    let config = config(&args, &mut models)?;
+    let cameras = &config.cameras;
+    for camera in cameras {
         let name = || format!("camera `{}`", camera.name);
         camera.location.check().with_context(name)?;
         if camera.calibration == Calibration::Assumed
@@ -74,13 +81,18 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
         }
     }
     let stop = Arc::new(Stop::default());
-    let sinks = sinks(&cameras, &models, &stop);
+    let (emit, emitted) = mpsc::channel();
+    let sinks = sinks(&args, &config, &models, emit, &stop)?;
     let mask = sinks.iter().any(|sink| sink.wants_masks());
     let engine = engine(args, models, cameras.len(), mask)?;
     stop_on_signals(&stop).context("signals cannot be handled")?;
     let inputs = cameras.iter().map(CameraConfig::input).collect();
-    watch(inputs, engine, sinks, &stop);
-    Ok(ExitCode::SUCCESS)
+    let mut done = ExitCode::SUCCESS;
+    for error in watch(inputs, engine, sinks, emitted, &stop) {
+        log::error!("{error}");
+        done = ExitCode::FAILURE;
+    }
+    Ok(done)
 }
 
 /// Sets `stop` on Ctrl-C and SIGTERM.
@@ -102,10 +114,17 @@ fn stop_on_signals(stop: &Arc<Stop>) -> io::Result<()> {
 }
 
 /// Where results go.
-fn sinks(cameras: &[CameraConfig], models: &Models, stop: &Arc<Stop>) -> Vec<Box<dyn Sink>> {
+fn sinks(
+    args: &Args,
+    config: &Config,
+    models: &Models,
+    emit: Sender<Event>,
+    stop: &Arc<Stop>,
+) -> anyhow::Result<Vec<Box<dyn Sink>>> {
+    let cameras = &config.cameras;
     let named = cameras.iter().map(|camera| Named {
         camera: camera.name.clone(),
-        robot: models.robot(camera.robot).to_owned(),
+        robot: models.robot(camera.robot.place).to_owned(),
     });
     let closed = Arc::clone(stop);
     let lines = Lines::new(named.collect(), io::stdout(), move |error| {
@@ -115,18 +134,41 @@ fn sinks(cameras: &[CameraConfig], models: &Models, stop: &Arc<Stop>) -> Vec<Box
         // The reader, such as `head`, has what it wanted.
         closed.set();
     });
-    // Every other sink is put beside it here.
-    vec![Box::new(lines)]
+    let mut sinks: Vec<Box<dyn Sink>> = vec![Box::new(lines)];
+    if !config.warnings.rules.is_empty() {
+        let observers: Vec<_> = cameras.iter().map(CameraConfig::observer).collect();
+        // Nobody listens any more at the end.
+        let emit = move |event| drop(emit.send(event));
+        sinks.push(Box::new(Warnings::start(
+            &config.warnings,
+            &observers,
+            emit,
+        )?));
+    }
+    if let Some(file) = &args.record {
+        let recorded = cameras.iter().map(|camera| {
+            let description = models.description(camera.robot.place)?;
+            Some(RecordedCamera {
+                name: camera.name.clone(),
+                robot: description.robot.clone(),
+                joints: description.joints.clone(),
+                canonical: description.camera,
+            })
+        });
+        let recorded: Vec<_> = recorded.flatten().collect();
+        sinks.push(Box::new(Recorder::create(file, &recorded)?));
+    }
+    Ok(sinks)
 }
 
-fn cameras(args: &Args, models: &mut Models) -> anyhow::Result<Vec<CameraConfig>> {
+fn config(args: &Args, models: &mut Models) -> anyhow::Result<Config> {
     if let Some(file) = &args.config {
         let mut find = |robot: Option<&str>, file: Option<&Path>| {
             models
                 .find(robot, file)
                 .map_err(|error| format!("{error:#}"))
         };
-        return Ok(Config::load(file, &mut find)?.cameras);
+        return Ok(Config::load(file, &mut find)?);
     }
     let robot = models.find(args.robot.as_deref(), args.weights.as_deref())?;
     let calibration = match (&args.camera, args.hfov) {
@@ -141,7 +183,10 @@ fn cameras(args: &Args, models: &mut Models) -> anyhow::Result<Vec<CameraConfig>
             ..CameraConfig::new(format!("camera_{number}"), location, robot)
         })
     });
-    cameras.collect()
+    Ok(Config {
+        cameras: cameras.collect::<anyhow::Result<_>>()?,
+        warnings: Default::default(),
+    })
 }
 
 fn engine(
@@ -181,8 +226,8 @@ fn engine(
 struct Models(Vec<(PathBuf, Model)>);
 
 impl Models {
-    /// The place of a robot's model or a model file.
-    fn find(&mut self, robot: Option<&str>, file: Option<&Path>) -> anyhow::Result<usize> {
+    /// A robot's model or a model file.
+    fn find(&mut self, robot: Option<&str>, file: Option<&Path>) -> anyhow::Result<KnownModel> {
         if let Some(robot) = robot {
             weights::robot_name(robot).map_err(anyhow::Error::msg)?;
         }
@@ -204,12 +249,19 @@ impl Models {
                 path.display()
             );
         }
-        Ok(place)
+        Ok(KnownModel {
+            place,
+            uncertainty_m: self.description(place).and_then(uncertainty_m),
+        })
     }
 
     /// The robot that a model finds.
     fn robot(&self, place: usize) -> &str {
-        let model = self.0.get(place);
-        model.map_or("", |(_, model)| &model.description.robot)
+        self.description(place).map_or("", |of| &of.robot)
+    }
+
+    fn description(&self, place: usize) -> Option<&Description> {
+        let (_, model) = self.0.get(place)?;
+        Some(&model.description)
     }
 }

@@ -2,15 +2,7 @@ use image::{GrayImage, RgbImage, RgbaImage};
 use rayon::prelude::*;
 use tiny_skia::{Color, FillRule, LineCap, Paint, PathBuilder, PixmapMut, Stroke, Transform};
 
-/// Colours of the joints, in the model's order; they begin again after the last.
-pub const JOINT_COLOURS: [[u8; 3]; 6] = [
-    [230, 57, 70],
-    [255, 150, 30],
-    [255, 225, 60],
-    [60, 135, 255],
-    [155, 85, 225],
-    [255, 130, 200],
-];
+use super::JOINT_COLOURS;
 
 const TINT: [u8; 3] = [0, 220, 110];
 const TINT_STRENGTH: f32 = 0.45;

@@ -4,17 +4,19 @@
 mod annotated;
 #[cfg(feature = "cli")]
 mod chart;
+mod colours;
 mod mask;
 #[cfg(feature = "cli")]
 mod sheet;
 
 #[cfg(feature = "cli")]
-pub use annotated::{JOINT_COLOURS, annotated};
+pub use annotated::annotated;
 #[cfg(feature = "cli")]
 pub use chart::{
     BarChart, BarGroup, ChartError, Line, LineChart, Row, RowChart, bar_charts, line_charts,
     row_chart,
 };
+pub use colours::JOINT_COLOURS;
 pub use mask::mask_image;
 #[cfg(feature = "cli")]
 pub use sheet::{SheetRow, sheet};

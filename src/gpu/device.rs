@@ -136,7 +136,8 @@ impl Device {
     /// it; nothing is submitted but by calls that say so.
     ///
     /// # Errors
-    /// [`GpuError::Limit`] where the device has less than WebGPU's defaults of what every kernel needs.
+    /// [`GpuError::Limit`] where the device has less than WebGPU's defaults of what every kernel needs, and
+    /// [`GpuError::Lost`].
     pub fn from_host(device: wgpu::Device, queue: wgpu::Queue) -> Result<Self, GpuError> {
         let host = Self {
             tier: Tier::with(device.features()),
@@ -151,6 +152,18 @@ impl Device {
             device,
             queue,
         };
+        #[cfg(not(target_arch = "wasm32"))]
+        {
+            // A device that was lost before made a buffer that is not valid: of that the host's handler would
+            // hear.
+            let scope = host.device.push_error_scope(wgpu::ErrorFilter::Validation);
+            let checked = host.check();
+            let refused = pollster::block_on(scope.pop());
+            checked?;
+            if let Some(error) = refused {
+                return Err(convert(error));
+            }
+        }
         let limits = host.device.limits();
         for (what, needed, allowed) in adapter::needs(&limits) {
             host.require(what, needed.into(), allowed.into())?;

@@ -94,7 +94,7 @@ pub enum GpuError {
     /// The adapter has too little memory.
     #[error("out of GPU memory: {0}")]
     OutOfMemory(String),
-    /// The driver refused a call: a defect of this library or of the driver.
+    /// The driver refused a call: a defect of this library or of the driver, or a host's view of several layers.
     #[error("GPU validation failed: {0}")]
     Validation(String),
     /// The device is gone; open another one and build anew.

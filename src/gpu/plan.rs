@@ -380,9 +380,9 @@ fn slot<'a>(
 ) -> Result<(&'a mut Rectify, Rectification), GpuError> {
     let batch = slots.len();
     let slot = slots.get_mut(index).ok_or(GpuError::Size {
-        what: "batch index",
+        what: "batch: images",
         expected: batch,
-        found: index,
+        found: index.saturating_add(1),
     })?;
     let params = Rectification {
         index: index as u32,

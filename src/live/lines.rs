@@ -6,6 +6,7 @@ use std::time::{Duration, SystemTime};
 
 use serde::Serialize;
 
+use super::warning::{ActionReport, Warning};
 use super::{Event, EventKind, Observation, Rates, Sink, Statistics};
 use crate::cascade::EstimateLine;
 
@@ -59,16 +60,28 @@ enum Content<'a> {
         #[serde(skip_serializing_if = "Option::is_none")]
         camera: Option<&'a str>,
         at_s: f64,
-        #[serde(skip_serializing_if = "Option::is_none")]
-        reason: Option<&'a str>,
-        #[serde(skip_serializing_if = "Option::is_none")]
-        retry_in_s: Option<f64>,
+        #[serde(flatten)]
+        details: Details<'a>,
     },
     Statistics {
         at_s: f64,
         lines_lost: u64,
         cameras: Vec<CameraRates<'a>>,
     },
+}
+
+/// What there is to say of an event besides its name.
+#[derive(Serialize)]
+#[serde(untagged)]
+enum Details<'a> {
+    Nothing {},
+    Failure {
+        reason: &'a str,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        retry_in_s: Option<f64>,
+    },
+    Warning(&'a Warning),
+    Action(&'a ActionReport),
 }
 
 #[derive(Serialize)]
@@ -159,13 +172,21 @@ impl Sink for Lines {
     }
 
     fn event(&mut self, event: &Event) {
-        let (name, reason, retry_in) = match &event.kind {
-            EventKind::Live => ("live", None, None),
-            EventKind::Stale => ("stale", None, None),
-            EventKind::Failed { reason, retry_in } => ("failed", Some(reason), *retry_in),
-            EventKind::Ended => ("ended", None, None),
-            EventKind::DeviceLost { reason } => ("device_lost", Some(reason), None),
-            EventKind::DeviceBack => ("device_back", None, None),
+        let (name, details) = match &event.kind {
+            EventKind::Live => ("live", Details::Nothing {}),
+            EventKind::Stale => ("stale", Details::Nothing {}),
+            EventKind::Failed { reason, retry_in } => {
+                let retry_in_s = retry_in.map(|time| time.as_secs_f64());
+                ("failed", Details::Failure { reason, retry_in_s })
+            }
+            EventKind::Ended => ("ended", Details::Nothing {}),
+            EventKind::DeviceLost { reason } => {
+                let retry_in_s = None;
+                ("device_lost", Details::Failure { reason, retry_in_s })
+            }
+            EventKind::DeviceBack => ("device_back", Details::Nothing {}),
+            EventKind::Warning(warning) => ("warning", Details::Warning(warning)),
+            EventKind::Action(report) => ("action", Details::Action(report)),
         };
         self.write(
             "event",
@@ -173,8 +194,7 @@ impl Sink for Lines {
                 event: name,
                 camera: event.camera.map(|camera| self.name(camera)),
                 at_s: seconds(event.at),
-                reason: reason.map(String::as_str),
-                retry_in_s: retry_in.map(|time| time.as_secs_f64()),
+                details,
             },
         );
     }

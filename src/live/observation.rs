@@ -3,6 +3,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use image::RgbaImage;
 
+use super::warning::{ActionReport, Warning};
 use crate::camera::Camera;
 use crate::cascade::Estimate;
 
@@ -69,6 +70,10 @@ pub enum EventKind {
     },
     /// A device is open again.
     DeviceBack,
+    /// A warning rule's state changed; the camera is the one that changed it.
+    Warning(Warning),
+    /// An action was done for a warning, or failed.
+    Action(ActionReport),
 }
 
 /// A camera's figures over the last second.
@@ -96,9 +101,17 @@ pub struct Statistics {
     pub cameras: Vec<Rates>,
 }
 
+/// Why a sink gave up.
+pub type SinkError = Box<dyn std::error::Error + Send + Sync>;
+
 /// Where results go. Calls come from one thread, in order, and must not wait: what writes to a disk or a network has
 /// a thread and a bounded queue of its own.
 pub trait Sink: Send {
+    /// Whether it needs the masks of the estimates, which are read back only then.
+    fn wants_masks(&self) -> bool {
+        false
+    }
+
     /// A frame was searched.
     fn observation(&mut self, observation: &Observation);
 
@@ -108,8 +121,11 @@ pub trait Sink: Send {
     /// A second is over.
     fn statistics(&mut self, statistics: &Statistics);
 
-    /// Whether it needs the masks of the estimates, which are read back only then.
-    fn wants_masks(&self) -> bool {
-        false
+    /// Nothing more comes: what is waiting is brought to its end, within a second.
+    ///
+    /// # Errors
+    /// Why the sink gave up, also where that was long ago and it only ignored what came since.
+    fn finish(&mut self) -> Result<(), SinkError> {
+        Ok(())
     }
 }

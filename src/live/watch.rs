@@ -9,18 +9,20 @@ use super::message::Message;
 use super::pulse::Pulse;
 use super::reader::Reader;
 use super::scheduler::Scheduler;
-use super::{Event, EventKind, Input, Sink, Statistics, Stop};
+use super::{Event, EventKind, Input, Sink, SinkError, Statistics, Stop};
 
-/// Watches cameras until `stop` is set, or all sources came to their end and all their frames are answered. `sinks`
-/// are dropped at the end.
+/// Watches cameras until `stop` is set, or all sources came to their end and all their frames are answered. Then
+/// `sinks` finish; what kept any from it is returned. What arrives from `emitted`, where sinks send what they have to
+/// say, goes to all sinks.
 ///
 /// Threads that cannot be stopped in time (a driver that does not return) are left behind.
 pub fn watch(
     inputs: Vec<Input>,
     engine: Box<dyn Engine>,
     sinks: Vec<Box<dyn Sink>>,
+    emitted: Receiver<Event>,
     stop: &Arc<Stop>,
-) {
+) -> Vec<SinkError> {
     let mailboxes = Arc::new(Mailboxes::new(inputs.len()));
     let (sender, messages) = channel();
     let robots = inputs.iter().map(|input| input.robot).collect();
@@ -44,18 +46,23 @@ pub fn watch(
         thread::spawn(move || reader.run());
     }
     drop(sender);
-    Desk {
+    let mut desk = Desk {
         sinks,
+        emitted,
         pulses,
         mailboxes,
         ticked: Instant::now(),
-    }
-    .run(&messages, stop);
+    };
+    desk.run(&messages, stop);
+    desk.pass_on();
+    let finished = desk.sinks.iter_mut().map(|sink| sink.finish());
+    finished.filter_map(Result::err).collect()
 }
 
 /// Where all that happens comes together, in order.
 struct Desk {
     sinks: Vec<Box<dyn Sink>>,
+    emitted: Receiver<Event>,
     pulses: Vec<Pulse>,
     mailboxes: Arc<Mailboxes>,
     /// When the last second was over.
@@ -71,7 +78,7 @@ impl Desk {
     /// How long threads have to end.
     const FAREWELL: Duration = Duration::from_millis(250);
 
-    fn run(mut self, messages: &Receiver<Message>, stop: &Stop) {
+    fn run(&mut self, messages: &Receiver<Message>, stop: &Stop) {
         while !stop.is_set() {
             // A frame that came in time is not late because we are.
             for message in messages.try_iter().take(Self::MOST) {
@@ -79,6 +86,7 @@ impl Desk {
             }
             let now = Instant::now();
             self.look(now);
+            self.pass_on();
             match messages.recv_timeout(self.wait(now)) {
                 Ok(message) => self.handle(message),
                 Err(RecvTimeoutError::Timeout) => {}
@@ -156,6 +164,8 @@ impl Desk {
                 for sink in &mut self.sinks {
                     sink.observation(&observation);
                 }
+                // What a sink says of this answer does not wait for the next one.
+                self.pass_on();
             }
             Message::DeviceLost { reason } => self.event(None, EventKind::DeviceLost { reason }),
             Message::DeviceBack => self.event(None, EventKind::DeviceBack),
@@ -169,13 +179,24 @@ impl Desk {
     }
 
     fn event(&mut self, camera: Option<usize>, kind: EventKind) {
-        let event = Event {
+        self.tell(&Event {
             at: SystemTime::now(),
             camera,
             kind,
-        };
+        });
+        self.pass_on();
+    }
+
+    /// Tells all sinks what one of them said.
+    fn pass_on(&mut self) {
+        while let Ok(event) = self.emitted.try_recv() {
+            self.tell(&event);
+        }
+    }
+
+    fn tell(&mut self, event: &Event) {
         for sink in &mut self.sinks {
-            sink.event(&event);
+            sink.event(event);
         }
     }
 }

@@ -338,7 +338,7 @@ pub(super) async fn estimate(
     const MIN_SURE: u32 = 10;
     const MAX_RADIUS: f32 = 1.5;
     let random = &mut case.random;
-    // More than a workgroup's, but of no more planes than WebGPU's textures have layers.
+    // More than a workgroup's; in a texture, no more planes than WebGPU's have layers.
     let most = if layout == Layout::Texture { 42 } else { 67 };
     let (count, batch) = (random.of(&[1, 6, 7]), random.of(&[5, most]));
     // The first image shows a robot; of the others some do not, and some have impossible joints.

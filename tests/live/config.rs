@@ -3,15 +3,17 @@
 use std::path::Path;
 
 use whereabot::camera::Orientation;
-use whereabot::live::{Calibration, CameraConfig, Config, Location};
+use whereabot::live::{Calibration, CameraConfig, Config, KnownModel, Location};
+
+use super::simulated::known;
 
 /// Robots are found by name; files too.
-fn find(robot: Option<&str>, weights: Option<&Path>) -> Result<usize, String> {
+fn find(robot: Option<&str>, weights: Option<&Path>) -> Result<KnownModel, String> {
     match (robot, weights) {
         (_, Some(file)) if !file.exists() => Err(format!("no file {}", file.display())),
         (Some("ur9"), _) => Err("no weights for robot `ur9`".into()),
-        (Some("ur10"), _) => Ok(1),
-        _ => Ok(0),
+        (Some("ur10"), _) => Ok(known(1)),
+        _ => Ok(known(0)),
     }
 }
 
@@ -58,11 +60,11 @@ fn a_file_is_what_it_says() {
         panic!("{cameras:?}");
     };
     assert_eq!(a.location, Location::Folder(folder.path().join("photos")));
-    assert_eq!((a.fps, a.repeat, a.robot), (Some(2.0), true, 0));
+    assert_eq!((a.fps, a.repeat, a.robot), (Some(2.0), true, known(0)));
     assert_eq!(a.orientation, Orientation::Rotate90);
     assert!(matches!(a.calibration, Calibration::CameraInfo(camera) if camera.width == 64));
     assert_eq!(b.location, Location::Stream("rtsp://10.0.0.1/x".into()));
-    assert_eq!((b.fps, b.repeat, b.robot), (None, false, 1));
+    assert_eq!((b.fps, b.repeat, b.robot), (None, false, known(1)));
     assert_eq!(b.calibration, Calibration::Hfov(90_f64.to_radians()));
     assert_eq!(c.location, Location::Video(folder.path().join("clip.mp4")));
     assert_eq!(c.calibration, Calibration::Assumed);

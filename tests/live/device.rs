@@ -10,11 +10,11 @@ use whereabot::cascade::{
     BatchImage, BatchLocator, BatchOptions, Estimate, LocateError, Locator, Output, Status,
 };
 use whereabot::gpu::{AdapterRequest, Device, GpuError, Precision};
-use whereabot::live::{Engine, EventKind, Frame, GpuEngine, GpuOptions, Observation, Stop, watch};
+use whereabot::live::{Engine, EventKind, Frame, GpuEngine, GpuOptions, Observation, Stop};
 use whereabot::network::Model;
 
 use super::known::{XYZ, model};
-use super::simulated::{Collector, Simulated, Told};
+use super::simulated::{Collector, Simulated, Told, watch};
 
 /// The tiny model, whose joints depend on the image.
 pub fn tiny() -> Model {

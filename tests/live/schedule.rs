@@ -3,8 +3,8 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::simulated::{Collector, Simulated, StandIn};
-use whereabot::live::{EventKind, Input, Observation, Stop, watch};
+use super::simulated::{Collector, Simulated, StandIn, watch};
+use whereabot::live::{EventKind, Input, Observation, Stop};
 
 const MS: Duration = Duration::from_millis(1);
 

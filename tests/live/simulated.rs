@@ -1,16 +1,36 @@
 //! Cameras, engines and sinks that are not there.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, mpsc};
 use std::time::{Duration, Instant, SystemTime};
 
 use image::{Rgba, RgbaImage};
 use whereabot::camera::Orientation;
 use whereabot::cascade::{Estimate, LocateError, Status};
 use whereabot::live::{
-    Calibration, Engine, Event, EventKind, Frame, IN_FLIGHT, Input, Observation, Shot, Sink,
-    Source, SourceError, Statistics, Stop, Stream,
+    Calibration, Engine, Event, EventKind, Frame, IN_FLIGHT, Input, KnownModel, Observation, Shot,
+    Sink, Source, SourceError, Statistics, Stop, Stream,
 };
+
+/// A model's place, of which nothing is known.
+pub const fn known(place: usize) -> KnownModel {
+    KnownModel {
+        place,
+        uncertainty_m: None,
+    }
+}
+
+/// Watches with sinks that say nothing.
+pub fn watch(
+    inputs: Vec<Input>,
+    engine: Box<dyn Engine>,
+    sinks: Vec<Box<dyn Sink>>,
+    stop: &Arc<Stop>,
+) {
+    let (_, emitted) = mpsc::channel();
+    let errors = whereabot::live::watch(inputs, engine, sinks, emitted, stop);
+    assert!(errors.is_empty(), "{errors:?}");
+}
 
 /// A camera that gives `count` frames, one each `period`.
 pub struct Simulated {

@@ -9,11 +9,11 @@ use image::{DynamicImage, ImageFormat, Rgb, RgbImage};
 use serde_json::json;
 use whereabot::camera::{Camera, Orientation};
 use whereabot::cascade::Status;
-use whereabot::live::{Calibration, CameraConfig, EventKind, Location, Observation, Stop, watch};
+use whereabot::live::{Calibration, CameraConfig, EventKind, Location, Observation, Stop};
 
 use super::device::{Judge, engine};
 use super::rtsp::Server;
-use super::simulated::Collector;
+use super::simulated::{Collector, known, watch};
 
 /// Frames a second of all of them.
 const RATE: u32 = 10;
@@ -86,7 +86,7 @@ fn four_sources_at_once_are_answered_as_single_images() {
 
     let cameras = ["clip.mkv", "photos", "recorded", &server.address].map(|source| {
         let location = Location::new(source, temporary.path()).unwrap();
-        let mut camera = CameraConfig::new(source.to_owned(), location, 0);
+        let mut camera = CameraConfig::new(source.to_owned(), location, known(0));
         camera.calibration = Calibration::Hfov(1.2);
         if camera.location.is_paced() {
             camera.fps = Some(RATE.into());
@@ -187,7 +187,7 @@ fn images_are_turned_upright_and_so_is_their_camera() {
             calibration: Calibration::Hfov(1.2),
             orientation,
             fps: Some(20.0),
-            ..CameraConfig::new("turned".into(), location.clone(), 0)
+            ..CameraConfig::new("turned".into(), location.clone(), known(0))
         };
         let collector = Collector::default();
         let engine = super::simulated::StandIn::new(Duration::from_millis(1), 1);
@@ -261,7 +261,7 @@ fn a_broken_picture_is_passed_over() {
     let location = Location::new("photos", temporary.path()).unwrap();
     let camera = CameraConfig {
         fps: Some(50.0),
-        ..CameraConfig::new("broken".into(), location, 0)
+        ..CameraConfig::new("broken".into(), location, known(0))
     };
     let collector = Collector::default();
     let engine = super::simulated::StandIn::new(Duration::from_millis(1), 1);

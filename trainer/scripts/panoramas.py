@@ -15,7 +15,7 @@ import OpenEXR
 from PIL import Image
 
 WIDTH, HEIGHT, FOCAL = 512, 424, 365.0
-TEST = {"apartment", "bridge", "hall", "warehouse"}
+TEST = {"city", "hall", "lab"}
 VIEWS = 12
 
 

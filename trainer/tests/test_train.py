@@ -140,6 +140,27 @@ def test_committed_golden_files_are_what_pytorch_computes(tmp_path, request):
     assert (values["joints"] - load_file(committed / "tiny.activations.safetensors")["joints"]).abs().max() > 1e-5
 
 
+def test_joints_are_trained_on_beside_a_model_file_s_mask_network(train, recording, tmp_path):
+    cache, first, second = ["--cache", str(tmp_path / "cache")], tmp_path / "a.safetensors", tmp_path / "b.safetensors"
+    steps = ["--iterations", "2", "--validation-samples", "4"]
+    mask_run = train("train-mask", "mask", *steps, "--crop", "32", "24")
+    joint_run = train("train-joint", "joint", *steps)
+
+    def export(mask, joint, out):
+        main(["export", "--mask", str(mask), "--joint", str(joint), "--validation", str(recording),
+              "--validation-samples", "10", "--out", str(out), *cache])
+        return read_model(out)
+
+    mask, joint, description = export(mask_run, joint_run, first)
+    joint_run = train("train-joint", "joint-on", *steps, "--init-from", str(first), "--mask-run", str(first),
+                      "--estimated-masks", "0.5")
+    kept, other, again = export(first, joint_run, second)
+    assert all(torch.equal(tensor, kept.state_dict()[key]) for key, tensor in mask.state_dict().items())
+    assert not all(torch.equal(tensor, other.state_dict()[key]) for key, tensor in joint.state_dict().items())
+    for key in ("mask_training", "calibration"):
+        assert again["card"][key] == description["card"][key]
+
+
 @pytest.mark.parametrize("layers", [paper_mask_layers(), context_mask_layers()])
 def test_folding_normalisation_keeps_the_function(layers):
     torch.manual_seed(0)

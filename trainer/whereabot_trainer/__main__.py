@@ -93,7 +93,9 @@ def main(argv=None):
     _training_flags(command, minutes=40, batch=8, learning_rate=(4e-3, 2e-5), momentum=(0.95, 0.95),
                     dilations=(1, 3, 9, 27, 1))
     command.add_argument("--family", choices=("paper", "context"), default="paper",
-                         help="the paper's network, or a wider one with skips that has no --dilations (%(default)s)")
+                         help="the paper's network, or a wider one with skips that has no --dilations and no --kernel (%(default)s)")
+    command.add_argument("--kernel", type=int, default=3, metavar="K",
+                         help="columns and rows of the paper's network's convolutions (%(default)s)")
     command.add_argument("--crop", nargs=2, type=int, default=(160, 128), metavar=("W", "H"),
                          help="pixels of a training crop (%(default)s)")
     command.add_argument("--zoom", nargs=2, type=float, default=(0.7, 1.6), metavar=("LEAST", "MOST"),
@@ -113,7 +115,8 @@ def main(argv=None):
     command.add_argument("--pool", type=int, default=4, metavar="P", help="size of both max-pools (%(default)s)")
     command.add_argument("--overlay", choices=("threshold", "multiply"), default="threshold",
                          help="colour where the mask is at least 0.5, or colour times mask (%(default)s)")
-    command.add_argument("--mask-run", metavar="RUN", help="finished run of train-mask, to validate the full system")
+    command.add_argument("--mask-run", metavar="RUN", help="finished run of train-mask, or a model file, whose masks"
+                         " the full system is validated with")
     command.add_argument("--estimated-masks", type=float, default=0.0, metavar="SHARE",
                          help="share of training samples with the mask run's masks for the true ones (%(default)s)")
     command.add_argument("--estimated-after", type=float, default=0.0, metavar="PROGRESS",
@@ -123,8 +126,8 @@ def main(argv=None):
     command.set_defaults(run=_run(train.train_joint))
 
     command = commands.add_parser("export", help="write both networks as a model file")
-    command.add_argument("--mask", required=True, metavar="RUN")
-    command.add_argument("--joint", required=True, metavar="RUN")
+    command.add_argument("--mask", required=True, metavar="RUN", help="run of train-mask, or a model file whose mask network stays")
+    command.add_argument("--joint", required=True, metavar="RUN", help="run of train-joint")
     source = command.add_mutually_exclusive_group(required=True)
     source.add_argument("--validation", nargs="+", metavar="DIR",
                         help="recordings to choose the presence threshold and measure the figures on")

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from . import __version__, data, evaluate
-from .model import describe, write_model
-from .train import load_network, output_unit
+from .model import describe, read_model, write_model
+from .train import load_mask, load_network, output_unit
 
 SURE_THRESHOLDS = (0.7, 0.8, 0.9, 0.95, 0.97, 0.98)
 
@@ -36,10 +36,8 @@ def choose_presence(robots, without, passing=0.05):
 
 def export_runs(args):
     """Folds calibration and standardisation into the weights, measures the cascade, and writes the model file."""
-    mask, mask_state = load_network(args.mask)
+    mask, mask_card = load_mask(args.mask), _mask_card(args.mask)
     joint, joint_state = load_network(args.joint)
-    shift = mask_state["figures"]["logit_shift"]
-    evaluate.shift_logits(mask, shift)
     rule = joint_state["card"]["overlay"]
 
     samples = data.Samples(args.validation or args.recording, args.cache)
@@ -98,14 +96,13 @@ def export_runs(args):
         "data": {"training": joint_state["card"]["training_recordings"], "validation": samples.sources,
                  "protocol": joint_state["card"]["protocol"], "note": args.note},
         "arm_length_m": arm,
-        "mask_training": _training(mask_state), "joint_training": _training(joint_state),
-        "calibration": {"logit_shift": shift, "why": "inverse class weights bias the mask towards the robot; the shift"
-                        " that gives the best validation IoU at 0.5 is added to the last bias"},
-        "figures": figures, "curves": _curves(args.mask, args.joint), "trainer": f"whereabot-trainer {__version__}, torch {torch.__version__.split('+')[0]}",
+        "mask_training": mask_card["mask_training"], "joint_training": _training(joint_state),
+        "calibration": mask_card["calibration"], "figures": figures,
+        "curves": {"mask_accuracy": mask_card["curves"]["mask_accuracy"], **_curves(args.joint, JOINT_CURVES)}, "trainer": f"whereabot-trainer {__version__}, torch {torch.__version__.split('+')[0]}",
         "licence": args.licence,
     }
     description = describe(
-        mask.layers, joint.layers, family=mask_state["card"]["family"], robot=robot, overlay=rule,
+        mask.layers, joint.layers, family=mask_card["mask_training"]["family"], robot=robot, overlay=rule,
         presence={"mask_threshold": 0.5, "sure_threshold": sure, "min_sure": least}, card=card)
     write_model(args.out, mask, joint, description, args.dtype)
     print(json.dumps({"chosen": description["presence"], "figures": figures}, indent=1))
@@ -117,17 +114,28 @@ def _rate(hits):
     return f"{sum(hits)} of {len(hits)}"
 
 
-def _curves(mask_run, joint_run):
+MASK_CURVES = {"accuracy": "mask_accuracy"}
+JOINT_CURVES = {"true_mask_mean_cm": "true_mask_cm", "estimated_mask_mean_cm": "estimated_mask_cm"}
+
+
+def _mask_card(path):
+    """What the card says of the mask network of a run's folder or, as it stands there, of a model file."""
+    if not Path(path).is_dir():
+        return read_model(path)[2]["card"]
+    state = load_network(path)[1]
+    return {
+        "mask_training": _training(state), "curves": _curves(path, MASK_CURVES),
+        "calibration": {"logit_shift": state["figures"]["logit_shift"], "why": "inverse class weights bias the mask towards the"
+                        " robot; the shift that gives the best validation IoU at 0.5 is added to the last bias"},
+    }
+
+
+def _curves(run, columns):
     """Validation figures over iterations (the paper's three plots), as lists of [iteration, value]."""
-    curves = {}
-    for run, columns in ((mask_run, {"accuracy": "mask_accuracy"}),
-                         (joint_run, {"true_mask_mean_cm": "true_mask_cm", "estimated_mask_mean_cm": "estimated_mask_cm"})):
-        with open(Path(run) / "log.csv", newline="") as file:
-            rows = list(csv.DictReader(file))
-        for column, name in columns.items():
-            if rows and column in rows[0]:
-                curves[name] = [[int(row["iteration"]), float(row[column])] for row in rows]
-    return curves
+    with open(Path(run) / "log.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {name: [[int(row["iteration"]), float(row[column])] for row in rows]
+            for column, name in columns.items() if rows and column in rows[0]}
 
 
 def _training(state):

@@ -18,14 +18,14 @@ MASK_INPUT = "image"
 JOINT_INPUT = "overlay"
 
 
-def paper_mask_layers(dilations=(1, 2, 4, 8, 1)):
-    """The paper's mask network: four dilated convolutions of 32 filters and one of one filter, all 3x3."""
+def paper_mask_layers(dilations=(1, 2, 4, 8, 1), kernel=3):
+    """The paper's mask network: four dilated convolutions of 32 filters and one of one filter."""
     layers, source = [], MASK_INPUT
     for number, dilation in enumerate(dilations, start=1):
         last = number == len(dilations)
         layers.append({
             "name": f"conv{number}", "op": "conv2d", "inputs": [source], "out_channels": 1 if last else 32,
-            "kernel": 3, "dilation": dilation, "activation": "sigmoid" if last else "relu",
+            "kernel": kernel, "dilation": dilation, "activation": "sigmoid" if last else "relu",
         })
         source = layers[-1]["name"]
     return layers

@@ -233,6 +233,15 @@ def load_network(run):
     return network.eval().fold_normalisation(), state
 
 
+def load_mask(path):
+    """The mask network of a run's folder, calibrated, or of a model file, which is; in eval mode."""
+    if not Path(path).is_dir():
+        return read_model(path)[0]
+    network, state = load_network(path)
+    evaluate.shift_logits(network, state["figures"]["logit_shift"])
+    return network
+
+
 @torch.no_grad()
 def start_from(network, tensors, images):
     """Gives the untrained `network` another one's weights, whose normalisation is folded away, in place.
@@ -277,7 +286,7 @@ def train_mask(args):
     height, width = args.crop[1], args.crop[0]
     card |= {"family": args.family, "foreground_share": share, "w_fg": w_fg, "w_bg": w_bg,
              "crop": args.crop, "camera": args.camera, **({"zoom": args.zoom} if args.camera == "free" else {})}
-    layers = context_mask_layers() if args.family == "context" else paper_mask_layers(args.dilations)
+    layers = context_mask_layers() if args.family == "context" else paper_mask_layers(args.dilations, args.kernel)
     network = initialise(Network(layers, MASK_INPUT, normalise=args.normalise))
     if args.init_from:
         start_from(network, starting_tensors(args.init_from, "mask")[0], samples.pixels(numbers[:: len(numbers) // 64 + 1])[0])
@@ -437,8 +446,7 @@ def train_joint(args):
 
     estimated = held_out_estimated = None
     if args.mask_run:
-        mask_network, state = load_network(args.mask_run)
-        evaluate.shift_logits(mask_network, state["figures"]["logit_shift"])
+        mask_network = load_mask(args.mask_run)
         mask_network.to(args.device, memory_format=torch.channels_last)
         held_out_estimated = evaluate.estimate_masks(mask_network, held_out, validation, args.device)
         if args.estimated_masks > 0:

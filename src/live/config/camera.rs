@@ -3,8 +3,9 @@ use std::path::PathBuf;
 use serde::Deserialize;
 use toml::Spanned;
 
-use super::{ConfigError, Document, FindModel};
+use super::{ConfigError, Document, FindModel, KnownModel};
 use crate::camera::{Camera, Orientation};
+use crate::live::warning::{Observer, Pose};
 use crate::live::{Calibration, Input, Location};
 
 /// A camera, checked.
@@ -14,8 +15,8 @@ pub struct CameraConfig {
     pub name: String,
     /// Where its frames come from.
     pub location: Location,
-    /// The place of its robot's model among all models.
-    pub robot: usize,
+    /// Its robot's model.
+    pub robot: KnownModel,
     /// What its images were taken with.
     pub calibration: Calibration,
     /// What makes its images upright.
@@ -24,11 +25,13 @@ pub struct CameraConfig {
     pub fps: Option<f64>,
     /// Whether it begins again at its end.
     pub repeat: bool,
+    /// Where it is in the common frame, where that is known.
+    pub world_from_camera: Option<Pose>,
 }
 
 impl CameraConfig {
     /// Of a camera that nothing is known of but its source.
-    pub fn new(name: String, location: Location, robot: usize) -> Self {
+    pub fn new(name: String, location: Location, robot: KnownModel) -> Self {
         Self {
             name,
             location,
@@ -37,6 +40,16 @@ impl CameraConfig {
             orientation: Orientation::NoTransforms,
             fps: None,
             repeat: false,
+            world_from_camera: None,
+        }
+    }
+
+    /// The camera, as warnings see it.
+    pub fn observer(&self) -> Observer {
+        Observer {
+            name: self.name.clone(),
+            world_from_camera: self.world_from_camera,
+            uncertainty_m: self.robot.uncertainty_m,
         }
     }
 
@@ -46,7 +59,7 @@ impl CameraConfig {
             source: self.location.source(self.fps, self.repeat),
             calibration: self.calibration,
             orientation: self.orientation,
-            robot: self.robot,
+            robot: self.robot.place,
         }
     }
 }
@@ -66,6 +79,7 @@ pub(super) struct CameraTable {
     orientation: OrientationName,
     fps: Option<Spanned<f64>>,
     repeat: Option<Spanned<bool>>,
+    world_from_camera: Option<Pose>,
 }
 
 /// A webcam's number, or anything else.
@@ -169,6 +183,7 @@ impl CameraTable {
             orientation: self.orientation.into(),
             fps: self.fps.map(Spanned::into_inner),
             repeat,
+            world_from_camera: self.world_from_camera,
         })
     }
 

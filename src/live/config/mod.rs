@@ -12,6 +12,7 @@ pub use camera::CameraConfig;
 pub use error::ConfigError;
 pub(in crate::live) use error::Document;
 
+use super::warning;
 use camera::CameraTable;
 
 /// A configuration file, checked whole.
@@ -19,6 +20,8 @@ use camera::CameraTable;
 pub struct Config {
     /// The cameras, in the file's order.
     pub cameras: Vec<CameraConfig>,
+    /// When the robot is too close, and what is done then.
+    pub warnings: warning::Config,
 }
 
 /// The file as it is written. Other parts' tables stand beside the cameras, each a type of its module that knows how
@@ -28,11 +31,23 @@ pub struct Config {
 struct File {
     #[serde(default, rename = "camera")]
     cameras: Vec<Spanned<CameraTable>>,
+    #[serde(default, rename = "warning")]
+    rules: Vec<warning::Rule>,
+    #[serde(default, rename = "action")]
+    actions: Vec<warning::Action>,
 }
 
-/// Gives the place of a model among all models, and loads it if it is new: of a robot's name or a model file or both;
-/// what is wrong with them otherwise.
-pub type FindModel<'a> = dyn FnMut(Option<&str>, Option<&Path>) -> Result<usize, String> + 'a;
+/// Finds a model, and loads it if it is new: of a robot's name or a model file or both; what is wrong with them otherwise.
+pub type FindModel<'a> = dyn FnMut(Option<&str>, Option<&Path>) -> Result<KnownModel, String> + 'a;
+
+/// A model that is loaded.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct KnownModel {
+    /// Its place among all models.
+    pub place: usize,
+    /// How far off its joints are, in metres ([`warning::uncertainty_m`]).
+    pub uncertainty_m: Option<f64>,
+}
 
 impl Config {
     /// Reads `file`. Paths in it start at its own folder.
@@ -58,7 +73,12 @@ impl Config {
         find_model: &mut FindModel<'_>,
     ) -> Result<Self, ConfigError> {
         let document = Document { file, text };
-        let File { cameras } = toml::from_str(text).map_err(|error| document.refused(&error))?;
+        let file: File = toml::from_str(text).map_err(|error| document.refused(&error))?;
+        let File {
+            cameras,
+            rules,
+            actions,
+        } = file;
         if cameras.is_empty() {
             let expected = "expected at least one [[camera]], found none";
             return Err(document.fault("camera", &Spanned::new(0..0, ()), expected));
@@ -68,6 +88,15 @@ impl Config {
             let camera = table.into_inner().check(&document, &checked, find_model)?;
             checked.push(camera);
         }
-        Ok(Self { cameras: checked })
+        let warnings = warning::Config { rules, actions };
+        let observers: Vec<_> = checked.iter().map(CameraConfig::observer).collect();
+        warnings.check(&observers).map_err(|error| {
+            let message = format!("expected {}, found {}", error.expected, error.found);
+            document.fault(error.key, &Spanned::new(error.span, ()), message)
+        })?;
+        Ok(Self {
+            cameras: checked,
+            warnings,
+        })
     }
 }
