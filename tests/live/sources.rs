@@ -228,7 +228,7 @@ fn a_stream_may_change_its_size() {
     std::fs::write(&file, both).unwrap();
     let camera = CameraConfig {
         calibration: Calibration::Hfov(1.2),
-        ..CameraConfig::new("both".into(), Location::Video(file), 0)
+        ..CameraConfig::new("both".into(), Location::Video(file), known(0))
     };
     let collector = Collector::default();
     let engine = super::simulated::StandIn::new(Duration::from_millis(1), 1);
