@@ -76,7 +76,7 @@ impl Desk {
     /// Most messages between two looks at the clock.
     const MOST: usize = 1000;
     /// How long threads have to end.
-    const FAREWELL: Duration = Duration::from_millis(400);
+    const FAREWELL: Duration = Duration::from_millis(250);
 
     fn run(&mut self, messages: &Receiver<Message>, stop: &Stop) {
         while !stop.is_set() {

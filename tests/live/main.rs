@@ -13,6 +13,7 @@ mod command;
 mod config;
 mod device;
 mod faults;
+mod lines;
 mod program;
 mod rtsp;
 mod schedule;

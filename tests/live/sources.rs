@@ -211,6 +211,45 @@ fn images_are_turned_upright_and_so_is_their_camera() {
 }
 
 #[test]
+fn a_stream_may_change_its_size() {
+    let temporary = tempfile::tempdir().unwrap();
+    let file = temporary.path().join("both.ts");
+    let mut both = Vec::new();
+    for size in ["64x48", "128x96"] {
+        let made = Command::new("ffmpeg")
+            .args(["-nostdin", "-v", "error", "-f", "lavfi", "-i"])
+            .arg(format!("testsrc=size={size}:rate={RATE}:duration=1"))
+            .args(["-c:v", "mpeg2video", "-g", "1", "-f", "mpegts", "-"])
+            .output()
+            .unwrap();
+        assert!(made.status.success());
+        both.extend(made.stdout);
+    }
+    std::fs::write(&file, both).unwrap();
+    let camera = CameraConfig {
+        calibration: Calibration::Hfov(1.2),
+        ..CameraConfig::new("both".into(), Location::Video(file), known(0))
+    };
+    let collector = Collector::default();
+    let engine = super::simulated::StandIn::new(Duration::from_millis(1), 1);
+    let sinks = vec![Box::new(collector.clone()) as _];
+    let stop = Arc::new(Stop::default());
+    watch(vec![camera.input()], Box::new(engine), sinks, &stop);
+    let observations = collector.observations();
+    for size in [(64, 48), (128, 96)] {
+        let of = observations.iter().filter(|o| o.image.dimensions() == size);
+        let of: Vec<_> = of.collect();
+        // A decoder may miss one where two streams meet.
+        assert!(of.len() > 3, "{size:?}: {}", of.len());
+        // The field of view is the same, the picture is not grey.
+        let view = Camera::from_hfov(size.0, size.1, 1.2);
+        assert!(of.iter().all(|o| o.view == view));
+        let lit = |o: &&Observation| o.image.pixels().any(|p| p.0[0] > 200);
+        assert!(of.iter().all(lit));
+    }
+}
+
+#[test]
 fn a_broken_picture_is_passed_over() {
     let temporary = tempfile::tempdir().unwrap();
     let photos = temporary.path().join("photos");

@@ -1,0 +1,134 @@
+//! JSON Lines: what a slow reader misses is counted, one that leaves is told of.
+
+use std::io::{self, Write};
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant, SystemTime};
+
+use serde_json::Value;
+use whereabot::live::{Event, EventKind, Lines, Named, Sink, Statistics};
+
+/// A reader that reads when it is told to.
+struct Slow {
+    go: Receiver<()>,
+    read: Arc<Mutex<Vec<u8>>>,
+}
+
+impl Write for Slow {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        // Whoever told it left: no more waiting.
+        let _ = self.go.recv();
+        self.read.lock().unwrap().extend(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+fn slow() -> (Slow, Sender<()>, Arc<Mutex<Vec<u8>>>) {
+    let (go, told) = channel();
+    let read = Arc::new(Mutex::new(Vec::new()));
+    let output = Slow {
+        go: told,
+        read: Arc::clone(&read),
+    };
+    (output, go, read)
+}
+
+fn lines(output: impl Write + Send + 'static) -> Lines {
+    let named = Named {
+        camera: "a \"quoted\" name".into(),
+        robot: "cube".into(),
+    };
+    Lines::new(vec![named], output, |_| {})
+}
+
+fn event() -> Event {
+    Event {
+        at: SystemTime::now(),
+        camera: Some(0),
+        kind: EventKind::Live,
+    }
+}
+
+fn statistics() -> Statistics {
+    Statistics {
+        at: SystemTime::now(),
+        cameras: Vec::new(),
+    }
+}
+
+/// How many lines the last statistics say were lost, and how many events were read.
+fn account(read: &[u8]) -> (u64, u64) {
+    let text = std::str::from_utf8(read).unwrap();
+    assert!(text.ends_with('\n'));
+    let lines: Vec<Value> = text
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect();
+    let events = lines.iter().filter(|line| line["type"] == "event");
+    let statistics = lines.iter().rfind(|line| line["type"] == "statistics");
+    let lost = statistics.unwrap()["lines_lost"].as_u64().unwrap();
+    (lost, events.count() as u64)
+}
+
+#[test]
+fn a_slow_reader_holds_nobody_up_and_learns_what_it_missed() {
+    for count in [3000, 10] {
+        let (output, go, read) = slow();
+        let mut lines = lines(output);
+        let start = Instant::now();
+        for _ in 0..count {
+            lines.event(&event());
+        }
+        assert!(start.elapsed() < Duration::from_secs(2));
+        // It reads on, and there is room again.
+        drop(go);
+        while read.lock().unwrap().len() < 500 {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        std::thread::sleep(Duration::from_millis(100));
+        lines.statistics(&statistics());
+        drop(lines);
+        let (lost, events) = account(&read.lock().unwrap());
+        assert_eq!(lost + events, count);
+        // With the negative control: few lines are all written.
+        assert_eq!(lost > 0, count == 3000);
+    }
+}
+
+#[test]
+fn a_reader_that_never_reads_does_not_keep_us() {
+    let (output, _go, read) = slow();
+    let mut lines = lines(output);
+    lines.event(&event());
+    let start = Instant::now();
+    drop(lines);
+    assert!(start.elapsed() < Duration::from_secs(1));
+    assert!(read.lock().unwrap().is_empty());
+}
+
+#[test]
+fn an_output_that_fails_is_told_of_once() {
+    struct Broken;
+    impl Write for Broken {
+        fn write(&mut self, _: &[u8]) -> io::Result<usize> {
+            Err(io::ErrorKind::BrokenPipe.into())
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+    let (sender, told) = channel();
+    let mut lines = Lines::new(Vec::new(), Broken, move |error| {
+        sender.send(error.kind()).unwrap();
+    });
+    lines.event(&event());
+    let kind = told.recv_timeout(Duration::from_secs(5)).unwrap();
+    assert_eq!(kind, io::ErrorKind::BrokenPipe);
+    // What comes later is of no interest to anybody.
+    lines.event(&event());
+}
