@@ -422,7 +422,7 @@ fn what_comes_in_is_what_a_client_gets() {
             distance_m: Some(distance_m),
             uncertainty_m: None,
             why: None,
-            frame: None,
+            frame_number: None,
             latency_ms: None,
         };
         Event {

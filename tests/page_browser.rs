@@ -87,7 +87,7 @@ impl Program {
                     distance_m,
                     uncertainty_m: None,
                     why,
-                    frame: None,
+                    frame_number: None,
                     latency_ms: None,
                 };
                 sink.event(&Event {
