@@ -611,17 +611,28 @@ fn too_many_clients_are_turned_away_until_others_go() {
 fn a_page_that_is_dropped_frees_its_port_and_lets_clients_go() {
     let (server, mut sink, address) = page();
     let known = change(&changes(address, 0).0);
-    let waiting = std::thread::spawn(move || changes(address, known));
-    let idle = connect(address);
+    // Connections that would be kept: one waits for news, one has got its answer.
+    let ask = |path: &str| {
+        let mut stream = connect(address);
+        write!(stream, "GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
+        stream
+    };
+    let mut waiting = ask(&format!("/changes?since={known}"));
+    let mut kept = ask("/icon.svg");
     std::thread::sleep(Duration::from_millis(100));
     let start = Instant::now();
     drop(server);
     assert!(start.elapsed() < Duration::from_secs(5));
-    waiting.join().unwrap();
     assert!(TcpStream::connect(address).is_err());
     // Its sink goes nowhere, and says nothing of it.
     sink.observation(&observation(0, 0));
-    drop(idle);
+    let mut answer = Vec::new();
+    waiting.read_to_end(&mut answer).unwrap();
+    assert!(answer.is_empty());
+    let _ = kept.write_all(b"GET /icon.svg HTTP/1.1\r\nHost: localhost\r\n\r\n");
+    let _ = kept.read_to_end(&mut answer);
+    let answers = String::from_utf8(answer).unwrap();
+    assert_eq!(answers.matches("HTTP/1.1 200").count(), 1);
 }
 
 #[test]

@@ -222,13 +222,14 @@ fn statistics(frame: u64) -> Statistics {
 }
 
 /// Counts what a page asks for, the tones it makes, and what its security policy kept from it.
-const COUNTERS: &str = "
+const COUNTERS: &str = "{
     window.counts = { asked: 0, tones: 0, violations: [] };
     const { fetch } = window;
     window.fetch = (...what) => { counts.asked++; return fetch(...what); };
     const { start } = OscillatorNode.prototype;
     OscillatorNode.prototype.start = function (...when) { counts.tones++; return start.apply(this, when); };
-    document.addEventListener('securitypolicyviolation', ({ blockedURI }) => counts.violations.push(blockedURI));";
+    document.addEventListener('securitypolicyviolation', ({ blockedURI }) => counts.violations.push(blockedURI));
+}";
 
 fn open(program: &Program, width: u32, height: u32, scale: u32, theme: &str) -> Page {
     let mut page = Page::open(&["--disable-gpu"]);

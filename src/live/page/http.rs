@@ -89,8 +89,8 @@ struct Connection {
     buffer: Vec<u8>,
 }
 
-/// Answers the requests of a client until it goes, asks for what cannot be, or is too slow.
-pub(super) fn serve(stream: TcpStream, answer: impl Fn(&Request) -> Answer) {
+/// Answers the requests of a client until it goes, asks for what cannot be, is too slow, or there is no answer.
+pub(super) fn serve(stream: TcpStream, answer: impl Fn(&Request) -> Option<Answer>) {
     // Without it small answers wait; where it fails they do.
     let _ = stream.set_nodelay(true);
     let mut connection = Connection {
@@ -100,7 +100,10 @@ pub(super) fn serve(stream: TcpStream, answer: impl Fn(&Request) -> Answer) {
     loop {
         match connection.request() {
             Ok(request) => {
-                let sent = connection.send(&answer(&request), request.again, request.head);
+                let Some(answer) = answer(&request) else {
+                    return;
+                };
+                let sent = connection.send(&answer, request.again, request.head);
                 if sent.is_err() || !request.again {
                     return;
                 }

@@ -217,7 +217,11 @@ fn listen(listener: &TcpListener, site: &Arc<Site>, closed: &AtomicBool) {
             Ok(stream) => {
                 let (site, seat) = (site.clone(), seats.clone());
                 let client = Builder::new().name("page client".into()).spawn(move || {
-                    http::serve(stream, |request| site.answer(request));
+                    http::serve(stream, |request| {
+                        let answer = site.answer(request);
+                        // A browser keeps its connection, and would take an ended program for a live one.
+                        (!site.board.is_closed()).then_some(answer)
+                    });
                     drop(seat);
                 });
                 if let Err(error) = client {

@@ -229,6 +229,10 @@ impl Board {
         self.news.notify_all();
     }
 
+    pub fn is_closed(&self) -> bool {
+        self.lock().closed
+    }
+
     /// Encodes what clients wait for, until the board is closed.
     pub fn paint(&self) {
         loop {
