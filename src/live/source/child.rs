@@ -10,8 +10,10 @@ use super::showinfo::{Announced, Line, MAX_SIDE};
 use super::{Shot, SourceError};
 use crate::live::Stop;
 
-/// A frame must come at least this often, also the first one.
+/// A frame must come at least this often.
 const STALLED: Duration = Duration::from_secs(10);
+/// The first one may take longer: some streams begin with the next key frame only.
+const OPENING: Duration = Duration::from_secs(30);
 /// It is that many frames ahead of their pixels at most.
 const ANNOUNCED: usize = 64;
 
@@ -34,7 +36,8 @@ struct Shared {
 
 #[derive(Debug)]
 struct State {
-    last_frame: Instant,
+    /// When the next frame must have come, and after how long.
+    due: (Instant, Duration),
     /// Why we killed it.
     killed: Option<Killed>,
     /// Its last errors.
@@ -70,7 +73,7 @@ impl Child {
         let shared = Arc::new(Shared {
             process: Mutex::new(process),
             state: Mutex::new(State {
-                last_frame: Instant::now(),
+                due: (Instant::now() + OPENING, OPENING),
                 killed: None,
                 errors: VecDeque::new(),
                 oversized: None,
@@ -104,7 +107,7 @@ impl Child {
 
     /// A frame came.
     pub fn touch(&self) {
-        self.shared.state().last_frame = Instant::now();
+        self.shared.state().due = (Instant::now() + STALLED, STALLED);
     }
 
     /// Whether it was killed as everything is to stop.
@@ -124,7 +127,7 @@ impl Child {
         let state = self.shared.state();
         match (state.killed, &status) {
             (Some(Killed::Stopped), _) => return Ok(()),
-            (Some(Killed::Stalled), _) => return Err(SourceError::Stalled(STALLED)),
+            (Some(Killed::Stalled), _) => return Err(SourceError::Stalled(state.due.1)),
             (None, Ok(status)) if status.success() => return Ok(()),
             _ => {}
         }
@@ -236,8 +239,8 @@ impl Shared {
             if stop.wait(Duration::from_millis(50)) {
                 return self.kill(Killed::Stopped);
             }
-            let stalled = self.state().last_frame.elapsed() > STALLED;
-            if stalled {
+            let (due, _) = self.state().due;
+            if due < Instant::now() {
                 return self.kill(Killed::Stalled);
             }
         }

@@ -62,7 +62,8 @@ impl Ffmpeg {
                 command.arg("-i").arg(path);
             }
             Location::Stream(address) => {
-                command.args(["-fflags", "nobuffer"]);
+                // The frame rate is none of our business: finding it out would take many frames.
+                command.args(["-fflags", "nobuffer", "-fpsprobesize", "0"]);
                 if address.starts_with("rtsp") {
                     // Over UDP, a lost packet spoils a picture.
                     command.args(["-rtsp_transport", "tcp"]);
