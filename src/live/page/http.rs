@@ -294,7 +294,7 @@ mod tests {
         assert_eq!(request.host, "localhost:80");
         assert!(request.again && !request.head);
         for cut in [0, 3, 20, length - 1] {
-            assert_eq!(parse(text[..cut].as_bytes()).unwrap(), None);
+            assert_eq!(parse(&text.as_bytes()[..cut]).unwrap(), None);
         }
         let old = parse(b"HEAD / HTTP/1.0\r\nHost: a\r\n\r\n");
         let (old, _) = old.unwrap().unwrap();
