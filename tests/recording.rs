@@ -553,7 +553,7 @@ fn a_second_arm_is_in_the_mask_and_its_joints_are_not_recorded() {
         items.filter(|i| i.kind == Kind::Robot).cloned().collect()
     };
     let shots: Vec<Shot> = (0..60)
-        .map(|id| stage.free_shot(1, id, 1).unwrap())
+        .flat_map(|id| stage.free_shots(1, id, 1, 1).unwrap())
         .collect();
     let counts: Vec<usize> = shots.iter().map(|shot| visible(shot).len()).collect();
     let one = counts.iter().copied().filter(|&c| c > 0).min().unwrap();
@@ -651,6 +651,7 @@ fn request(folder: &Path, out: &str) -> Request {
         samples: 6,
         seed: 3,
         protocol: Protocol::FreeCamera,
+        cameras: 1,
         out: folder.join(out),
     }
 }
