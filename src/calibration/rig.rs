@@ -24,6 +24,16 @@ impl Spread {
         }
     }
 
+    /// That of the shipped weights for a joint at `point`, camera optical frame: it grows with the distance, and is
+    /// larger along the ray (README, "No calibration rig").
+    pub fn at(point: DVec3) -> Self {
+        let distance = point.length();
+        Self {
+            across_m: 0.035 * distance,
+            along_m: 0.09 * distance,
+        }
+    }
+
     /// The covariance of a joint's error, square metres; camera optical frame.
     pub fn covariance(&self, joint: DVec3) -> DMat3 {
         let ray = joint.normalize_or(DVec3::Z);

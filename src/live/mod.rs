@@ -4,6 +4,8 @@
 //! replaces it; the scheduler takes what is fresh from all mailboxes into one submission; what was found
 //! goes to every [`Sink`] as an [`Observation`].
 
+mod fusion;
 mod observation;
 
+pub use fusion::{Fused, Fusion};
 pub use observation::{Event, EventKind, Observation, Rates, Sink, Statistics};
