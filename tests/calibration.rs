@@ -3,9 +3,7 @@
 
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 use proptest::prelude::*;
-use whereabot::calibration::{
-    Pair, RegistrationError, Rig, RigOptions, Spread, kabsch, register,
-};
+use whereabot::calibration::{Pair, RegistrationError, Rig, RigOptions, Spread, kabsch, register};
 
 /// Numbers with mean 0 and deviation 1, the same for the same seed.
 struct Noise(u64);
@@ -30,8 +28,13 @@ impl Noise {
 
 fn transform() -> impl Strategy<Value = DAffine3> {
     let number = || -1.0..1.0_f64;
-    ([number(), number(), number(), number()], [number(), number(), number()])
-        .prop_filter("no rotation", |(q, _)| q.iter().map(|x| x * x).sum::<f64>() > 0.01)
+    (
+        [number(), number(), number(), number()],
+        [number(), number(), number()],
+    )
+        .prop_filter("no rotation", |(q, _)| {
+            q.iter().map(|x| x * x).sum::<f64>() > 0.01
+        })
         .prop_map(|(q, t)| {
             let turn = DQuat::from_array(q).normalize();
             DAffine3::from_rotation_translation(turn, 3.0 * DVec3::from(t))
@@ -148,7 +151,10 @@ fn the_stated_uncertainty_is_that_of_the_error() {
                 group.iter_mut().for_each(|pair| pair.from += off);
             }
             let found = register(&pairs).unwrap();
-            shift += found.transform.translation.distance_squared(truth.translation);
+            shift += found
+                .transform
+                .translation
+                .distance_squared(truth.translation);
             turn += angle(found.transform, truth).powi(2);
             stated_shift += found.translation_sigma_m().powi(2);
             stated_turn += found.rotation_sigma_rad().powi(2);
@@ -157,7 +163,10 @@ fn the_stated_uncertainty_is_that_of_the_error() {
         let turn: f64 = (turn / stated_turn).sqrt();
         // Few groups are taken to err together, whether they do or not.
         let least = if frames < 10 { 0.3 } else { 0.75 };
-        assert!((least..1.35).contains(&shift), "{frames}, {common}: {shift}");
+        assert!(
+            (least..1.35).contains(&shift),
+            "{frames}, {common}: {shift}"
+        );
         assert!((least..1.35).contains(&turn), "{frames}, {common}: {turn}");
     }
 }
@@ -181,9 +190,7 @@ fn the_way_back_is_as_sure_as_the_way() {
     // Levers are measured with noise in the one and without in the other.
     let farthest = |a: [[f64; 6]; 6], b: [[f64; 6]; 6]| {
         let cells = (0..6).flat_map(|i| (0..6).map(move |j| (i, j)));
-        let off = |(i, j): (usize, usize)| {
-            (a[i][j] - b[i][j]).abs() / (b[i][i] * b[j][j]).sqrt()
-        };
+        let off = |(i, j): (usize, usize)| (a[i][j] - b[i][j]).abs() / (b[i][i] * b[j][j]).sqrt();
         cells.map(off).fold(0.0, f64::max)
     };
     assert!(farthest(back.covariance, other.covariance) < 0.06);
@@ -209,10 +216,16 @@ fn what_cannot_be_told_is_an_error() {
             .collect()
     };
     let error = register(&line(0.0, &mut noise)).unwrap_err();
-    assert!(matches!(error, RegistrationError::Collinear { .. }), "{error}");
+    assert!(
+        matches!(error, RegistrationError::Collinear { .. }),
+        "{error}"
+    );
     // Noise makes a plane of a line, and means nothing.
     let error = register(&line(0.01, &mut noise)).unwrap_err();
-    assert!(matches!(error, RegistrationError::Undetermined { .. }), "{error}");
+    assert!(
+        matches!(error, RegistrationError::Undetermined { .. }),
+        "{error}"
+    );
     let mut wrong = pairs.clone();
     wrong[3].to.y = f64::NAN;
     assert_eq!(
@@ -259,7 +272,9 @@ const SPREAD: Spread = Spread {
 /// What a camera makes of the robot.
 fn seen(base_from_camera: DAffine3, time: f64, noise: &mut Noise) -> Vec<DVec3> {
     let camera_from_base = base_from_camera.inverse();
-    let joints = robot(time).into_iter().map(|j| camera_from_base.transform_point3(j));
+    let joints = robot(time)
+        .into_iter()
+        .map(|j| camera_from_base.transform_point3(j));
     joints
         .map(|joint| {
             let ray = joint.normalize();
@@ -306,8 +321,14 @@ fn cameras_that_see_the_same_robot_find_each_other() {
     for (camera, &place) in cameras.iter().enumerate().skip(1) {
         let pose = rigs[2].pose(camera).unwrap();
         let truth = cameras[0].inverse() * place;
-        let off = pose.first_from_camera.translation.distance(truth.translation);
-        assert!(off < 0.05 && off < 4.0 * pose.translation_sigma_m(), "{camera}: {off}");
+        let off = pose
+            .first_from_camera
+            .translation
+            .distance(truth.translation);
+        assert!(
+            off < 0.05 && off < 4.0 * pose.translation_sigma_m(),
+            "{camera}: {off}"
+        );
         assert!(angle(pose.first_from_camera, truth) < 0.03);
         assert!(pose.inlier_share > 0.9);
         // A neighbour's pose is another one.
@@ -332,7 +353,10 @@ fn poses_go_by_way_of_cameras_between() {
     }
     let pose = rig.pose(2).unwrap();
     let truth = cameras[0].inverse() * cameras[2];
-    let off = pose.first_from_camera.translation.distance(truth.translation);
+    let off = pose
+        .first_from_camera
+        .translation
+        .distance(truth.translation);
     assert!(off < 0.1 && off < 4.0 * pose.translation_sigma_m(), "{off}");
     assert!(pose.translation_sigma_m() > rig.pose(1).unwrap().translation_sigma_m());
 }
@@ -342,7 +366,15 @@ fn a_rig_follows_cameras_that_move_and_forgets() {
     let mut noise = Noise(5);
     let still = camera(0.0);
     let moving = |time: f64| camera(1.5 + 0.05 * time);
-    let rig = |memory_s| Rig::new(2, RigOptions { memory_s, ..RigOptions::default() });
+    let rig = |memory_s| {
+        Rig::new(
+            2,
+            RigOptions {
+                memory_s,
+                ..RigOptions::default()
+            },
+        )
+    };
     let (mut short, mut long) = (rig(1.0), rig(1000.0));
     for n in 0..600 {
         let time = n as f64 / 30.0;
@@ -384,7 +416,9 @@ fn one_camera_that_is_wrong_does_not_move_the_joints() {
     let fused = rig.fused();
     assert_eq!(fused[4].cameras, 3);
     assert_eq!(fused[3].cameras, 4);
-    let off = cameras[0].transform_point3(fused[4].xyz_m).distance(robot(5.9)[4]);
+    let off = cameras[0]
+        .transform_point3(fused[4].xyz_m)
+        .distance(robot(5.9)[4]);
     assert!(off < 0.06, "{off}");
 }
 
@@ -402,7 +436,10 @@ fn the_robot_itself_may_be_the_first_camera() {
     }
     for (number, truth) in (1..).zip(cameras) {
         let pose = rig.pose(number).unwrap();
-        let off = pose.first_from_camera.translation.distance(truth.translation);
+        let off = pose
+            .first_from_camera
+            .translation
+            .distance(truth.translation);
         assert!(off < 0.05, "{off}");
     }
 }

@@ -105,6 +105,9 @@ mod tests {
         assert_eq!(inverse([[1.0, 1.0], [1.0, 1.0]]), None);
         assert_eq!(inverse([[1.0, 0.0], [0.0, -1.0]]), None);
         assert_eq!(inverse([[f64::NAN, 0.0], [0.0, 1.0]]), None);
-        assert_eq!(inverse([[2.0, 0.0], [0.0, 4.0]]), Some([[0.5, 0.0], [0.0, 0.25]]));
+        assert_eq!(
+            inverse([[2.0, 0.0], [0.0, 4.0]]),
+            Some([[0.5, 0.0], [0.0, 0.25]])
+        );
     }
 }

@@ -383,7 +383,9 @@ fn trimmed(pairs: &[Pair]) -> Result<DAffine3, RegistrationError> {
     let mut random = SplitMix(0);
     let triples = (0..STARTS).filter_map(|_| {
         let triple = [(); 3].map(|()| random.below(points.len()));
-        let three = triple.iter().filter_map(|&index| points.get(index).copied());
+        let three = triple
+            .iter()
+            .filter_map(|&index| points.get(index).copied());
         kabsch(three).ok()
     });
     let starts: Vec<DAffine3> = std::iter::once(all).chain(triples).collect();

@@ -29,7 +29,7 @@ impl Spread {
     pub fn at(point: DVec3) -> Self {
         let distance = point.length();
         Self {
-            across_m: 0.035 * distance,
+            across_m: 0.03 * distance,
             along_m: 0.09 * distance,
         }
     }
@@ -336,7 +336,11 @@ impl Link {
         }
         // A twentieth of the memory changes little.
         let often = (0.05 * memory).min(1.0);
-        if self.found.as_ref().is_some_and(|(then, ..)| time_s - then < often) {
+        if self
+            .found
+            .as_ref()
+            .is_some_and(|(then, ..)| time_s - then < often)
+        {
             return;
         }
         let weighed = self.instants.iter().flat_map(|(then, pairs)| {

@@ -174,16 +174,13 @@ fn angle(a: DAffine3, b: DAffine3) -> f64 {
 }
 
 impl TogetherFigures {
-    fn new(
-        cameras: &[Vec<RigFrame>],
-        count: usize,
-        choices: impl Iterator<Item = u32>,
-    ) -> Self {
+    fn new(cameras: &[Vec<RigFrame>], count: usize, choices: impl Iterator<Item = u32>) -> Self {
         let (mut first_camera, mut base) = (Vec::new(), Vec::new());
         for choice in choices {
             let chosen = cameras.iter().enumerate();
             let chosen = chosen.filter(|(index, _)| choice >> index & 1 == 1);
-            let mut chosen: Vec<&[RigFrame]> = chosen.map(|(_, frames)| frames.as_slice()).collect();
+            let mut chosen: Vec<&[RigFrame]> =
+                chosen.map(|(_, frames)| frames.as_slice()).collect();
             base.extend(errors(&chosen, true));
             for _ in 0..chosen.len() {
                 first_camera.extend(errors(&chosen, false));
@@ -218,7 +215,11 @@ fn errors(cameras: &[&[RigFrame]], calibrated: bool) -> Vec<f64> {
         let Some(first) = frames.clone().next() else {
             continue;
         };
-        let truth = if calibrated { first.in_base() } else { first.truth.clone() };
+        let truth = if calibrated {
+            first.in_base()
+        } else {
+            first.truth.clone()
+        };
         if calibrated && learning {
             rig.observe(0, time, &truth, Spread::even(1e-3));
         }

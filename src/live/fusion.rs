@@ -32,12 +32,7 @@ pub struct Fusion<F> {
 impl<F: FnMut(Fused) + Send> Fusion<F> {
     /// `cameras`: the places in the configuration of those that watch this robot, the one whose frame all is in first.
     /// `smoothing_s`: a time constant and lag, none by default ([`Smoother`]). `fused` hears what comes out.
-    pub fn new(
-        cameras: &[usize],
-        options: RigOptions,
-        smoothing_s: Option<f64>,
-        fused: F,
-    ) -> Self {
+    pub fn new(cameras: &[usize], options: RigOptions, smoothing_s: Option<f64>, fused: F) -> Self {
         let most = cameras.iter().max().map_or(0, |most| most + 1);
         let place = |camera| cameras.iter().position(|&c| c == camera);
         Self {
@@ -97,7 +92,12 @@ mod tests {
     use crate::camera::Camera;
     use crate::cascade::{Estimate, Joint};
 
-    fn observation(camera: usize, milliseconds: u64, status: Status, joints: &[DVec3]) -> Observation {
+    fn observation(
+        camera: usize,
+        milliseconds: u64,
+        status: Status,
+        joints: &[DVec3],
+    ) -> Observation {
         let joint = |&xyz: &DVec3| Joint {
             name: "joint".into(),
             xyz_m: xyz.to_array(),
@@ -130,18 +130,30 @@ mod tests {
         );
         let run = |smoothing_s, cameras: [usize; 2]| {
             let mut all = Vec::new();
-            let mut sink = Fusion::new(&cameras, RigOptions::default(), smoothing_s, |f| all.push(f));
+            let mut sink = Fusion::new(&cameras, RigOptions::default(), smoothing_s, |f| {
+                all.push(f)
+            });
             for n in 0..20_u64 {
                 let turn = DQuat::from_rotation_z(0.1 * n as f64);
                 let joints: Vec<DVec3> = (0..6)
-                    .map(|j| turn * (0.3 * DVec3::new(f64::from(j), f64::from(j * j % 4), 0.5)) + 2.0 * DVec3::Z)
+                    .map(|j| {
+                        turn * (0.3 * DVec3::new(f64::from(j), f64::from(j * j % 4), 0.5))
+                            + 2.0 * DVec3::Z
+                    })
                     .collect();
-                let other = joints.iter().map(|&j| second_from_first.transform_point3(j));
+                let other = joints
+                    .iter()
+                    .map(|&j| second_from_first.transform_point3(j));
                 sink.observation(&observation(3, 100 * n, Status::Found, &joints));
                 // Of another robot, and not found.
                 sink.observation(&observation(2, 100 * n, Status::Found, &joints));
                 sink.observation(&observation(1, 100 * n + 9, Status::NotFound, &[]));
-                sink.observation(&observation(1, 100 * n + 10, Status::Found, &other.collect::<Vec<_>>()));
+                sink.observation(&observation(
+                    1,
+                    100 * n + 10,
+                    Status::Found,
+                    &other.collect::<Vec<_>>(),
+                ));
             }
             drop(sink);
             all
@@ -153,12 +165,18 @@ mod tests {
         assert!(last.joints.len() == 6 && last.joints.iter().all(|joint| joint.cameras == 2));
         let off = |fused: &Fused| {
             let pose = fused.poses[1].unwrap().first_from_camera;
-            pose.translation.distance(second_from_first.inverse().translation)
+            pose.translation
+                .distance(second_from_first.inverse().translation)
         };
         assert!(off(last) < 1e-6, "{}", off(last));
         // From the other camera it is the way back.
         assert!(off(run(None, [1, 3]).last().unwrap()) > 0.1);
         let smooth = run(Some(1.0), [3, 1]);
-        assert!(smooth.last().unwrap().joints[5].xyz_m.distance(last.joints[5].xyz_m) > 0.01);
+        assert!(
+            smooth.last().unwrap().joints[5]
+                .xyz_m
+                .distance(last.joints[5].xyz_m)
+                > 0.01
+        );
     }
 }

@@ -136,7 +136,10 @@ pub fn record(
     } else {
         vec![(request.out.clone(), header(request, &stage, None))]
     };
-    if recordings.iter().all(|(out, _)| out.join("recording.json").exists()) {
+    if recordings
+        .iter()
+        .all(|(out, _)| out.join("recording.json").exists())
+    {
         let done = next(&open(&recordings)?);
         if done >= request.samples {
             progress(done);
@@ -247,7 +250,9 @@ fn header(request: &Request, stage: &Stage, camera: Option<u64>) -> Header {
 
 fn open(recordings: &[(PathBuf, Header)]) -> Result<Vec<Writer>, RecordingError> {
     let writers = recordings.iter();
-    writers.map(|(out, header)| Writer::open(out, header)).collect()
+    writers
+        .map(|(out, header)| Writer::open(out, header))
+        .collect()
 }
 
 /// The sample to write next: all recordings have those before it.

@@ -324,7 +324,8 @@ impl Stage {
                         true
                     }
                     Some(rng) => {
-                        let mut tries = (0..40).map(|_| self.aim(&arm, &support, &view.window, rng));
+                        let mut tries =
+                            (0..40).map(|_| self.aim(&arm, &support, &view.window, rng));
                         let found = tries.find_map(|camera| camera);
                         view.camera_from_base = found.unwrap_or_default();
                         found.is_some()
@@ -460,7 +461,9 @@ impl Stage {
         let apart = |camera: DAffine3| {
             let forward = |camera: DAffine3| camera.matrix3.row(2);
             let others = others.iter().map(|&other| forward(other));
-            others.map(|other| other.angle_between(forward(camera))).fold(PI, f64::min)
+            others
+                .map(|other| other.angle_between(forward(camera)))
+                .fold(PI, f64::min)
         };
         let sweep = Sweep::new(&self.main.robot, 10 * POSES);
         let poses: Vec<Arm> = (0..sweep.len())

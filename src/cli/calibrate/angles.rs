@@ -89,7 +89,11 @@ impl Angles {
     /// Each frame's angles; `None` where there are none.
     pub fn of(&self, frames: &[Frame], by: Match, tolerance_s: f64) -> Vec<Option<Vec<f64>>> {
         match by {
-            Match::Order => self.rows.iter().map(|row| Some(row.angles.clone())).collect(),
+            Match::Order => self
+                .rows
+                .iter()
+                .map(|row| Some(row.angles.clone()))
+                .collect(),
             Match::File => {
                 let name = |file: &str| {
                     let name = Path::new(file).file_name();
@@ -166,7 +170,10 @@ fn table(path: &Path, text: &str, robot: &Robot) -> anyhow::Result<Vec<Row>> {
         let found = column(&names.each_ref().map(String::as_str));
         joints.push(found.with_context(|| {
             let (at, found) = (named(1), header.join(", "));
-            format!("{at}: expected a column {} (or {}, {}), found {found}", names[0], names[1], names[2])
+            format!(
+                "{at}: expected a column {} (or {}, {}), found {found}",
+                names[0], names[1], names[2]
+            )
         })?);
     }
     let mut rows = Vec::new();
@@ -179,10 +186,13 @@ fn table(path: &Path, text: &str, robot: &Robot) -> anyhow::Result<Vec<Row>> {
         let cell = |column: usize| record.get(column).unwrap_or_default();
         let number = |column: usize| -> anyhow::Result<f64> {
             let text = cell(column);
-            text.parse().ok().filter(|v: &f64| v.is_finite()).with_context(|| {
-                let name = header.get(column).map_or("", String::as_str);
-                format!("{}: {name}: expected a number, found {text:?}", place())
-            })
+            text.parse()
+                .ok()
+                .filter(|v: &f64| v.is_finite())
+                .with_context(|| {
+                    let name = header.get(column).map_or("", String::as_str);
+                    format!("{}: {name}: expected a number, found {text:?}", place())
+                })
         };
         let angles = joints.iter().map(|&column| number(column));
         let angles = angles.collect::<anyhow::Result<Vec<f64>>>()?;

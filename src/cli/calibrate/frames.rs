@@ -76,7 +76,9 @@ fn frame(line: Line, place: &str) -> anyhow::Result<Option<(Option<String>, Fram
     let status = line.status.as_deref();
     let joints = match (status, line.joints) {
         (Some("found"), Some(joints)) => joints,
-        (Some("found"), None) => bail!("joints: expected those of a robot that was found, found none"),
+        (Some("found"), None) => {
+            bail!("joints: expected those of a robot that was found, found none")
+        }
         (Some("not_found" | "invalid" | "error"), _) => Vec::new(),
         (found, _) => bail!(
             "status: expected found, not_found, invalid or error, found {}",

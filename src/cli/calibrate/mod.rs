@@ -78,7 +78,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     ensure!(
         !cameras.is_empty(),
         "expected lines of frames, found none in {}",
-        args.lines.iter().map(|l| l.display().to_string()).collect::<Vec<_>>().join(", ")
+        args.lines
+            .iter()
+            .map(|l| l.display().to_string())
+            .collect::<Vec<_>>()
+            .join(", ")
     );
     let mut failed = false;
     let mut reports = Vec::new();
@@ -107,7 +111,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             };
             Ok(line + "\n")
         };
-        reports.iter().map(line).collect::<anyhow::Result<String>>()?
+        reports
+            .iter()
+            .map(line)
+            .collect::<anyhow::Result<String>>()?
     };
     io::stdout().lock().write_all(text.as_bytes())?;
     Ok(if failed {
@@ -125,13 +132,21 @@ fn calibrate(
     tolerance_s: f64,
 ) -> anyhow::Result<Report> {
     let matched_by = angles.matches(frames)?;
-    let index: HashMap<&str, usize> = robot.joints.iter().map(|j| j.name.as_str()).zip(0..).collect();
+    let index: HashMap<&str, usize> = robot
+        .joints
+        .iter()
+        .map(|j| j.name.as_str())
+        .zip(0..)
+        .collect();
     let mut poses: Vec<Vec<DVec3>> = Vec::new();
     let mut pairs: Vec<Pair> = Vec::new();
     // Which joint each pair is.
     let mut joints: Vec<usize> = Vec::new();
     let (mut used, mut not_found, mut unmatched) = (0, 0, 0);
-    for (frame, angles) in frames.iter().zip(angles.of(frames, matched_by, tolerance_s)) {
+    for (frame, angles) in frames
+        .iter()
+        .zip(angles.of(frames, matched_by, tolerance_s))
+    {
         if frame.joints.is_empty() {
             not_found += 1;
             continue;
@@ -144,11 +159,16 @@ fn calibrate(
         let base = robot.joint_origins(&robot.link_poses(&angles));
         let group = pose_of(&mut poses, &base);
         for (name, point) in &frame.joints {
-            let joint = index.get(name.strip_suffix("_joint").unwrap_or(name)).copied();
+            let joint = index
+                .get(name.strip_suffix("_joint").unwrap_or(name))
+                .copied();
             let joint = joint.with_context(|| {
                 let known: Vec<&str> = robot.joints.iter().map(|j| j.name.as_str()).collect();
                 let known = known.join(", ");
-                format!("{}: joints: expected those of the URDF ({known}), found {name}", frame.place)
+                format!(
+                    "{}: joints: expected those of the URDF ({known}), found {name}",
+                    frame.place
+                )
             })?;
             let Some(&to) = base.get(joint) else {
                 continue;
@@ -205,7 +225,12 @@ fn pose_of(poses: &mut Vec<Vec<DVec3>>, joints: &[DVec3]) -> usize {
     })
 }
 
-fn residuals(robot: &Robot, pairs: &[Pair], joints: &[usize], found: &Registration) -> Vec<Residual> {
+fn residuals(
+    robot: &Robot,
+    pairs: &[Pair],
+    joints: &[usize],
+    found: &Registration,
+) -> Vec<Residual> {
     let back = found.transform.inverse();
     let named = robot.joints.iter().enumerate();
     named

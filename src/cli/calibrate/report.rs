@@ -95,8 +95,14 @@ impl Report {
             self.sure()
         );
         let _ = writeln!(text, "  translation  {x:9.4} {y:9.4} {z:9.4} m");
-        let _ = writeln!(text, "  rotation     {qx:9.5} {qy:9.5} {qz:9.5} {qw:9.5} (x y z w)");
-        let _ = writeln!(text, "               {roll:9.2} {pitch:9.2} {yaw:9.2} degrees (roll pitch yaw)");
+        let _ = writeln!(
+            text,
+            "  rotation     {qx:9.5} {qy:9.5} {qz:9.5} {qw:9.5} (x y z w)"
+        );
+        let _ = writeln!(
+            text,
+            "               {roll:9.2} {pitch:9.2} {yaw:9.2} degrees (roll pitch yaw)"
+        );
         let _ = writeln!(
             text,
             "  from {} of {} frames in {} poses of the robot, matched by {}; {} without the robot, {} without \
@@ -109,9 +115,14 @@ impl Report {
             self.frames_unmatched,
             100.0 * self.inlier_share
         );
-        let _ = writeln!(text, "  {:14} {:>7} {:>6} {:>9} {:>10}", "joint", "inliers", "of", "rms", "along ray");
+        let _ = writeln!(
+            text,
+            "  {:14} {:>7} {:>6} {:>9} {:>10}",
+            "joint", "inliers", "of", "rms", "along ray"
+        );
         for residual in &self.residuals {
-            let mm = |value: Option<f64>| value.map_or("-".into(), |m| format!("{:.0} mm", 1e3 * m));
+            let mm =
+                |value: Option<f64>| value.map_or("-".into(), |m| format!("{:.0} mm", 1e3 * m));
             let _ = writeln!(
                 text,
                 "  {:14} {:>7} {:>6} {:>9} {:>10}",

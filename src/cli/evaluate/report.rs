@@ -543,7 +543,15 @@ impl RigLine {
              percentile), and the standard deviation that was stated (median)"
         )?;
         let mut rows = vec![row([
-            "frames", "tries", "not told", "place, cm", "95 %", "stated", "turn, degrees", "95 %", "stated",
+            "frames",
+            "tries",
+            "not told",
+            "place, cm",
+            "95 %",
+            "stated",
+            "turn, degrees",
+            "95 %",
+            "stated",
         ])];
         rows.extend(figures.poses.iter().map(|line| {
             let median = |summary: Option<Summary>| number(summary.map(|s| s.median), 1);
@@ -568,7 +576,13 @@ impl RigLine {
              joint angles of the first half; judged on the second)"
         )?;
         let mut rows = vec![row([
-            "cameras", "first camera's: mean", "median", "95 %", "base: mean", "median", "95 %",
+            "cameras",
+            "first camera's: mean",
+            "median",
+            "95 %",
+            "base: mean",
+            "median",
+            "95 %",
         ])];
         rows.extend(figures.together.iter().map(|line| {
             let mut cells = vec![line.cameras.to_string()];
