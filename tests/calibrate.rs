@@ -236,6 +236,9 @@ fn frames_are_matched_by_file_name_and_by_order() {
         let (metres, radians) = off(&report, place);
         assert!(metres < 1e-6 && radians < 1e-6, "{metres} {radians}");
     }
+    bench.write("twice.jsonl", &(samples.clone() + &samples));
+    let stderr = bench.refused(&["lines.jsonl", "--angles", "twice.jsonl"]);
+    assert!(stderr.contains("found 000011.jpg twice"), "{stderr}");
     // By order the last one first is wrong.
     let wrong: String = samples.replace("\"image\"", "\"picture\"");
     bench.write("wrong.jsonl", &wrong);

@@ -25,15 +25,20 @@ impl Smoother {
         self.time_constant_s
     }
 
-    /// The smoothed points at `time_s`, which never goes back. After five time constants without points, or where
-    /// their number changes, it starts anew.
+    /// The smoothed points at `time_s`; an earlier time than the last counts as that. After five time constants without
+    /// points, or where their number changes, it starts anew.
     pub fn step(&mut self, time_s: f64, points: &[DVec3]) -> Vec<DVec3> {
+        let before = self
+            .last
+            .as_ref()
+            .map_or(f64::NEG_INFINITY, |(then, _)| *then);
+        let time_s = time_s.max(before);
+        let passed = time_s - before;
         let smoothed = match &self.last {
-            Some((before, last))
-                if last.len() == points.len()
-                    && (0.0..5.0 * self.time_constant_s).contains(&(time_s - before)) =>
+            Some((_, last))
+                if last.len() == points.len() && passed < 5.0 * self.time_constant_s =>
             {
-                let kept = (-(time_s - before) / self.time_constant_s).exp();
+                let kept = (-passed / self.time_constant_s).exp();
                 let pairs = points.iter().zip(last);
                 pairs.map(|(&new, &old)| new.lerp(old, kept)).collect()
             }
@@ -78,6 +83,7 @@ mod tests {
         assert!(smooth < 0.1 * raw, "{smooth} of {raw}");
         let far = DVec3::splat(9.0);
         assert_eq!(smoother.step(200.0, &[far]), [far]);
+        assert_eq!(smoother.step(199.9, &[DVec3::ZERO]), [far]);
         assert_eq!(smoother.step(200.1, &[far, far]).len(), 2);
         let mut off = Smoother::new(0.0);
         off.step(0.0, &[DVec3::ONE]);

@@ -1,6 +1,6 @@
 //! The robot's joint angles over time: CSV with a header, or JSON Lines.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::f64::consts::{PI, TAU};
 use std::path::Path;
 
@@ -75,6 +75,14 @@ impl Angles {
             return Ok(Match::Time);
         }
         if rows(|row| row.file.is_some()) && frames.iter().all(|frame| frame.file.is_some()) {
+            let mut seen = HashSet::new();
+            let names = self
+                .rows
+                .iter()
+                .filter_map(|row| name(row.file.as_deref()?));
+            if let Some(twice) = names.into_iter().find(|name| !seen.insert(name.clone())) {
+                bail!("expected joint angles of each file once, found {twice} twice");
+            }
             return Ok(Match::File);
         }
         ensure!(
@@ -95,10 +103,6 @@ impl Angles {
                 .map(|row| Some(row.angles.clone()))
                 .collect(),
             Match::File => {
-                let name = |file: &str| {
-                    let name = Path::new(file).file_name();
-                    name.map(|name| name.to_string_lossy().into_owned())
-                };
                 let rows = self.rows.iter();
                 let rows: HashMap<_, _> = rows
                     .filter_map(|row| Some((name(row.file.as_deref()?)?, &row.angles)))
@@ -118,6 +122,12 @@ impl Angles {
             }
         }
     }
+}
+
+/// A file's name without its folders.
+fn name(file: &str) -> Option<String> {
+    let name = Path::new(file).file_name();
+    name.map(|name| name.to_string_lossy().into_owned())
 }
 
 /// Angles at a time, between the rows before and after, both of which are near it. A joint turns the short way.
