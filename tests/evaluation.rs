@@ -929,6 +929,15 @@ fn cameras_at_once_are_judged_together() {
         code == 1 && stderr.contains("expected 6 samples of cube"),
         "{stderr}"
     );
+    let lines = bench.path("rig/camera_2/samples.jsonl");
+    let text = std::fs::read_to_string(&lines).unwrap();
+    let (first, second) = text.split_once('\n').unwrap();
+    let moved = second.replacen("1.0,0.0,0.0,0.0,0.0", "1.0,0.0,0.0,0.5,0.0", 1);
+    assert_ne!(moved, second);
+    std::fs::write(&lines, format!("{first}\n{moved}")).unwrap();
+    let (code, stderr) = bench.refused(&["--rig", "rig", "--weights", "cube.safetensors"]);
+    let told = "samples.jsonl:2: camera_from_base: expected a camera that stands still";
+    assert!(code == 1 && stderr.contains(told), "{stderr}");
     let (code, stderr) = bench.refused(&["--rig", "nothing", "--weights", "cube.safetensors"]);
     assert!(code == 1 && stderr.contains("camera_1"), "{stderr}");
 }

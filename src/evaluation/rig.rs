@@ -58,8 +58,8 @@ pub struct PoseFigures {
     pub turn_sigma_deg: Option<Summary>,
 }
 
-/// How far joints are off, averaged over the joints of an instant, centimetres; over all choices of so many cameras, and
-/// the second half of the instants.
+/// How far joints are off, averaged over the joints of an instant, centimetres; over up to twenty choices of so many
+/// cameras, and the second half of the instants.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TogetherFigures {
     /// So many.
@@ -74,9 +74,10 @@ impl RigFigures {
     /// Of cameras that stand still: for each its frames, the same instants in the same order.
     pub fn new(cameras: &[Vec<RigFrame>]) -> Self {
         let found = |frames: &Vec<RigFrame>| usable(frames).count();
-        let choices = |count: usize| {
+        let choices = |count: usize| -> Vec<u32> {
             (1..1_u32 << cameras.len().min(16))
-                .filter(move |choice| choice.count_ones() as usize == count)
+                .filter(|choice| choice.count_ones() as usize == count)
+                .collect()
         };
         Self {
             instants: cameras.iter().map(Vec::len).min().unwrap_or_default(),
@@ -86,7 +87,7 @@ impl RigFigures {
                 .map(|count| PoseFigures::new(cameras, count))
                 .collect(),
             together: (1..=cameras.len())
-                .map(|count| TogetherFigures::new(cameras, count, choices(count)))
+                .map(|count| TogetherFigures::new(cameras, count, &choices(count)))
                 .collect(),
         }
     }
@@ -174,9 +175,16 @@ fn angle(a: DAffine3, b: DAffine3) -> f64 {
 }
 
 impl TogetherFigures {
-    fn new(cameras: &[Vec<RigFrame>], count: usize, choices: impl Iterator<Item = u32>) -> Self {
+    /// Choices of cameras that are tried.
+    const CHOICES: usize = 20;
+
+    /// Of `choices` each has a bit set for each of its cameras.
+    fn new(cameras: &[Vec<RigFrame>], count: usize, choices: &[u32]) -> Self {
         let (mut first_camera, mut base) = (Vec::new(), Vec::new());
-        for choice in choices {
+        for choice in choices
+            .iter()
+            .step_by(choices.len().div_ceil(Self::CHOICES).max(1))
+        {
             let chosen = cameras.iter().enumerate();
             let chosen = chosen.filter(|(index, _)| choice >> index & 1 == 1);
             let mut chosen: Vec<&[RigFrame]> =

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use glam::{DAffine3, DMat4, DVec3};
 use indicatif::ProgressBar;
 
@@ -35,6 +35,19 @@ pub fn open(folder: &Path, models: &[Judged]) -> anyhow::Result<OpenRig> {
         cameras.push(super::open(&camera, models, Split::All)?);
     }
     for (number, camera) in (1..).zip(&cameras) {
+        let samples = camera.reader.samples().iter();
+        let mut placed = samples.filter(|sample| sample.camera_from_base.is_some());
+        let first = placed.next().and_then(|sample| sample.camera_from_base);
+        if let Some(moved) = placed.find(|sample| sample.camera_from_base != first) {
+            let file = camera.folder.join("samples.jsonl");
+            bail!(
+                "{}:{}: camera_from_base: expected a camera that stands still (record --fixed-camera), \
+                 found one that moved",
+                file.display(),
+                // Ids count from 0 without gaps.
+                moved.id + 1
+            );
+        }
         let header = camera.reader.header();
         let named = || camera.folder.join("recording.json").display().to_string();
         ensure!(
