@@ -1,7 +1,7 @@
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 
-use super::RegistrationError;
 use super::eigen::{inverse, symmetric_eigen};
+use super::{RegistrationError, Spread};
 
 /// A point that is known in two frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -30,6 +30,41 @@ impl Pair {
     fn variance(&self) -> f64 {
         let both = self.from_covariance + self.to_covariance;
         (both.x_axis.x + both.y_axis.y + both.z_axis.z) / 3.0
+    }
+}
+
+/// Poses of the robot in which no joint is farther from the other's than this, metres, count as one: what the networks
+/// make of them errs alike.
+const SAME_POSE_M: f64 = 0.05;
+
+impl Pair {
+    /// From a camera's frame to the robot's base frame. Of each image the joints in the camera's optical frame, as they
+    /// were found, and the same joints in the base frame, by the robot's joint angles; metres. A group is a pose of the
+    /// robot, numbered from 0.
+    pub fn of_images<'a>(
+        images: impl IntoIterator<Item = (&'a [DVec3], &'a [DVec3])>,
+    ) -> Vec<Self> {
+        let mut poses: Vec<&[DVec3]> = Vec::new();
+        let mut pairs = Vec::new();
+        for (found, base) in images {
+            let same = |pose: &&[DVec3]| {
+                let mut joints = pose.iter().zip(base);
+                pose.len() == base.len() && joints.all(|(a, b)| a.distance(*b) < SAME_POSE_M)
+            };
+            let group = poses.iter().position(same).unwrap_or(poses.len());
+            if group == poses.len() {
+                poses.push(base);
+            }
+            pairs.extend(found.iter().zip(base).map(|(&from, &to)| Self {
+                from,
+                from_covariance: Spread::at(from).covariance(from),
+                to,
+                to_covariance: DMat3::ZERO,
+                weight: 1.0,
+                group,
+            }));
+        }
+        pairs
     }
 }
 

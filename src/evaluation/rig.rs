@@ -1,4 +1,4 @@
-use glam::{DAffine3, DMat3, DQuat, DVec3};
+use glam::{DAffine3, DQuat, DVec3};
 use serde::Serialize;
 
 use super::Summary;
@@ -117,20 +117,13 @@ impl PoseFigures {
             for start in 0..tries_here {
                 let chosen = (start * most..(start + 1) * most)
                     .filter_map(|n| frames.get(n * stride % frames.len()));
-                let pairs = chosen.enumerate().flat_map(|(group, frame)| {
-                    let joints = frame.found.iter().copied().zip(frame.in_base());
-                    joints.map(move |(from, to)| Pair {
-                        from,
-                        from_covariance: Spread::at(from).covariance(from),
-                        to,
-                        to_covariance: DMat3::ZERO,
-                        weight: 1.0,
-                        group,
-                    })
-                });
+                let images: Vec<(&[DVec3], Vec<DVec3>)> = chosen
+                    .map(|frame| (frame.found.as_slice(), frame.in_base()))
+                    .collect();
+                let images = images.iter().map(|(found, base)| (*found, base.as_slice()));
                 tries += 1;
                 let truth = frames.first().and_then(|frame| frame.camera_from_base);
-                let found = register(&pairs.collect::<Vec<_>>());
+                let found = register(&Pair::of_images(images));
                 let (Ok(found), Some(truth)) = (found, truth) else {
                     undetermined += 1;
                     continue;

@@ -10,9 +10,9 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, ensure};
-use glam::{DMat3, DVec3};
+use glam::DVec3;
 
-use crate::calibration::{Pair, Registration, Spread, register};
+use crate::calibration::{Pair, Registration, register};
 use crate::recording::{Frames, Robot};
 use angles::Angles;
 use frames::Frame;
@@ -60,10 +60,6 @@ fn seconds(text: &str) -> Result<f64, String> {
         _ => Err("expected seconds, 0 or more".to_owned()),
     }
 }
-
-/// Poses of the robot in which no joint is farther from the other's than this, metres, count as one: what the
-/// networks make of them errs alike.
-const SAME_POSE_M: f64 = 0.05;
 
 /// Runs the command.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
@@ -138,11 +134,11 @@ fn calibrate(
         .map(|j| j.name.as_str())
         .zip(0..)
         .collect();
-    let mut poses: Vec<Vec<DVec3>> = Vec::new();
-    let mut pairs: Vec<Pair> = Vec::new();
-    // Which joint each pair is.
+    // Of each image the joints as they were found, and in the base frame.
+    let mut images: Vec<(Vec<DVec3>, Vec<DVec3>)> = Vec::new();
+    // Which joint each of them is.
     let mut joints: Vec<usize> = Vec::new();
-    let (mut used, mut not_found, mut unmatched) = (0, 0, 0);
+    let (mut not_found, mut unmatched) = (0, 0);
     for (frame, angles) in frames
         .iter()
         .zip(angles.of(frames, matched_by, tolerance_s))
@@ -155,35 +151,28 @@ fn calibrate(
             unmatched += 1;
             continue;
         };
-        used += 1;
         let base = robot.joint_origins(&robot.link_poses(&angles));
-        let group = pose_of(&mut poses, &base);
+        let (mut found, mut known) = (Vec::new(), Vec::new());
         for (name, point) in &frame.joints {
-            let joint = index
-                .get(name.strip_suffix("_joint").unwrap_or(name))
-                .copied();
-            let joint = joint.with_context(|| {
-                let known: Vec<&str> = robot.joints.iter().map(|j| j.name.as_str()).collect();
-                let known = known.join(", ");
+            let joint = index.get(name.strip_suffix("_joint").unwrap_or(name));
+            let joint = *joint.with_context(|| {
+                let names: Vec<&str> = robot.joints.iter().map(|j| j.name.as_str()).collect();
+                let names = names.join(", ");
                 format!(
-                    "{}: joints: expected those of the URDF ({known}), found {name}",
+                    "{}: joints: expected those of the URDF ({names}), found {name}",
                     frame.place
                 )
             })?;
-            let Some(&to) = base.get(joint) else {
-                continue;
-            };
-            joints.push(joint);
-            pairs.push(Pair {
-                from: *point,
-                from_covariance: Spread::at(*point).covariance(*point),
-                to,
-                to_covariance: DMat3::ZERO,
-                weight: 1.0,
-                group,
-            });
+            if let Some(&place) = base.get(joint) {
+                joints.push(joint);
+                found.push(*point);
+                known.push(place);
+            }
         }
+        images.push((found, known));
     }
+    let used = images.len();
+    let pairs = Pair::of_images(images.iter().map(|(found, known)| (&found[..], &known[..])));
     let found = register(&pairs).with_context(|| {
         let by = matched_by.name();
         format!(
@@ -207,21 +196,9 @@ fn calibrate(
         frames_used: used,
         frames_not_found: not_found,
         frames_unmatched: unmatched,
-        poses: poses.len(),
+        poses: pairs.iter().map(|pair| pair.group + 1).max().unwrap_or(0),
         inlier_share: found.inlier_share(),
         residuals: residuals(robot, &pairs, &joints, &found),
-    })
-}
-
-/// The number of the pose that `joints` are in.
-fn pose_of(poses: &mut Vec<Vec<DVec3>>, joints: &[DVec3]) -> usize {
-    let same = |pose: &Vec<DVec3>| {
-        let mut pairs = pose.iter().zip(joints);
-        pairs.all(|(a, b)| a.distance(*b) < SAME_POSE_M)
-    };
-    poses.iter().position(same).unwrap_or_else(|| {
-        poses.push(joints.to_vec());
-        poses.len() - 1
     })
 }
 
