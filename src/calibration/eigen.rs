@@ -8,10 +8,14 @@ pub(super) fn symmetric_eigen<const N: usize>(mut a: [[f64; N]; N]) -> [(f64, [f
     }
     // Five sweeps are enough in practice; what is not finite would never end.
     for _ in 0..30 {
-        let square = |row: &[f64; N]| row.iter().map(|x| x * x).sum::<f64>();
-        let all: f64 = a.iter().map(square).sum();
-        let diagonal: f64 = (0..N).map(|i| a[i][i] * a[i][i]).sum();
-        if all - diagonal <= f64::EPSILON * f64::EPSILON * all {
+        // Summed on their own: of the difference of two large sums too little would be left.
+        let (mut off, mut on) = (0.0, 0.0);
+        for (i, row) in a.iter().enumerate() {
+            for (j, value) in row.iter().enumerate() {
+                *(if i == j { &mut on } else { &mut off }) += value * value;
+            }
+        }
+        if off <= f64::EPSILON * f64::EPSILON * on {
             break;
         }
         for p in 0..N {
