@@ -127,10 +127,12 @@ proptest! {
         let wrong = found.inliers.iter().enumerate().filter(|&(n, &inlier)| inlier && n % 5 < 2).count();
         prop_assert!(wrong <= 2, "{wrong} outliers counted");
         prop_assert!((0.5..0.65).contains(&found.inlier_share()), "{}", found.inlier_share());
-        // Least squares alone are misled, and nothing is thrown away where nothing is wrong.
+        // Least squares alone are misled: by a third of the way to where the other robot is, a metre off. What errs
+        // each in its own way may cancel out. And nothing is thrown away where nothing is wrong.
         let plain = kabsch(pairs.iter().map(|p| (p.from, p.to, 1.0))).unwrap();
-        prop_assert!(plain.transform_point3(DVec3::Z * 2.0).distance(truth.transform_point3(DVec3::Z * 2.0)) > 0.04);
-        prop_assert!(register(&right).unwrap().inlier_share() > 0.95);
+        let misled = plain.transform_point3(DVec3::Z * 2.0).distance(truth.transform_point3(DVec3::Z * 2.0));
+        prop_assert!(!together || misled > 0.2, "{misled}");
+        prop_assert!(register(&right).unwrap().inlier_share() > 0.9);
     }
 }
 

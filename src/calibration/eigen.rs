@@ -30,9 +30,9 @@ pub(super) fn symmetric_eigen<const N: usize>(mut a: [[f64; N]; N]) -> [(f64, [f
                 for row in &mut a {
                     (row[p], row[q]) = (c * row[p] - s * row[q], s * row[p] + c * row[q]);
                 }
-                for k in 0..N {
-                    (a[p][k], a[q][k]) = (c * a[p][k] - s * a[q][k], s * a[p][k] + c * a[q][k]);
-                }
+                let (one, two) = (a[p], a[q]);
+                a[p] = std::array::from_fn(|k| c * one[k] - s * two[k]);
+                a[q] = std::array::from_fn(|k| s * one[k] + c * two[k]);
                 for row in &mut v {
                     (row[p], row[q]) = (c * row[p] - s * row[q], s * row[p] + c * row[q]);
                 }

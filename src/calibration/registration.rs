@@ -160,7 +160,8 @@ pub fn kabsch(
         let [_, (across, _), (along, _)] = symmetric_eigen(scatter.to_cols_array_2d());
         let [across_m, along_m] = [across, along].map(|s| (s.max(0.0) / total).sqrt());
         // Written so that NaN is refused.
-        if !(across_m > 1e-6 * along_m) {
+        let apart = across_m > 1e-6 * along_m;
+        if !apart {
             return Err(RegistrationError::Collinear { along_m, across_m });
         }
     }
@@ -277,7 +278,8 @@ fn finish(
     };
     let sigma = DVec3::from_array(std::array::from_fn(|i| covariance[i][i].max(0.0).sqrt()));
     // Written so that NaN is refused.
-    if !(sigma.length() <= 30_f64.to_radians()) {
+    let told = sigma.length() <= 30_f64.to_radians();
+    if !told {
         return Err(open(sigma));
     }
     Ok(Registration {
