@@ -2,6 +2,7 @@
 //! and where its joints are, in metres, in the camera's optical frame (REP 103).
 
 pub mod benchmark;
+pub mod calibration;
 pub mod camera;
 pub mod cascade;
 #[cfg(feature = "cli")]

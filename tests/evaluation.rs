@@ -870,3 +870,74 @@ fn the_shipped_weights_are_judged_on_the_gpu() {
         assert!(table.contains(part), "{part}: {table}");
     }
 }
+
+#[test]
+fn cameras_at_once_are_judged_together() {
+    let bench = Bench::new();
+    let near = |nearer: f64| {
+        let sample = |_| Known {
+            image: left_half,
+            mask: left_half,
+            nearer,
+        };
+        (0..6).map(sample).collect::<Vec<_>>()
+    };
+    bench.recording("rig/camera_1", "cube", &near(0.03));
+    bench.recording("rig/camera_2", "cube", &near(0.03));
+    let found = bench.json(&["--rig", "rig"]);
+    let rig = &found["rigs"][0];
+    assert_eq!(
+        (&rig["instants"], &rig["found"]),
+        (&json!(6), &json!([6, 6]))
+    );
+    for (line, tries) in [(0, 12), (1, 2), (3, 2)] {
+        let line = &rig["poses"][line];
+        assert_eq!(
+            (&line["tries"], &line["undetermined"]),
+            (&json!(tries), &json!(0))
+        );
+        // The camera stands where the joints put it: all of them are 3 cm too near.
+        assert!(close(&line["place_cm"]["median"], 3.0, 1e-3), "{line}");
+        assert!(close(&line["turn_deg"]["p95"], 0.0, 1e-3), "{line}");
+    }
+    assert_eq!(rig["poses"][2]["tries"], 0);
+    for (line, cameras) in [(0, 1), (1, 2)] {
+        let line = &rig["together"][line];
+        assert_eq!(line["cameras"], cameras);
+        assert!(close(&line["first_camera_cm"]["mean"], 3.0, 1e-3), "{line}");
+        // Calibrated, what is wrong always is not wrong any more.
+        assert!(close(&line["base_cm"]["mean"], 0.0, 1e-3), "{line}");
+    }
+    let arguments = [
+        "--rig",
+        "rig",
+        "--weights",
+        "cube.safetensors",
+        "--adapter",
+        "cpu",
+    ];
+    let (text, _, code) = bench.evaluate(&arguments);
+    assert_eq!(code, 0);
+    assert!(
+        text.contains("cube, 2 cameras, 6 instants, found in 6, 6"),
+        "{text}"
+    );
+
+    bench.recording("rig/camera_2", "cube", &near(0.03)[..5]);
+    let (code, stderr) = bench.refused(&["--rig", "rig", "--weights", "cube.safetensors"]);
+    assert!(
+        code == 1 && stderr.contains("expected 6 samples of cube"),
+        "{stderr}"
+    );
+    let lines = bench.path("rig/camera_2/samples.jsonl");
+    let text = std::fs::read_to_string(&lines).unwrap();
+    let (first, second) = text.split_once('\n').unwrap();
+    let moved = second.replacen("1.0,0.0,0.0,0.0,0.0", "1.0,0.0,0.0,0.5,0.0", 1);
+    assert_ne!(moved, second);
+    std::fs::write(&lines, format!("{first}\n{moved}")).unwrap();
+    let (code, stderr) = bench.refused(&["--rig", "rig", "--weights", "cube.safetensors"]);
+    let told = "samples.jsonl:2: camera_from_base: expected a camera that stands still";
+    assert!(code == 1 && stderr.contains(told), "{stderr}");
+    let (code, stderr) = bench.refused(&["--rig", "nothing", "--weights", "cube.safetensors"]);
+    assert!(code == 1 && stderr.contains("camera_1"), "{stderr}");
+}

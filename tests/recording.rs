@@ -553,7 +553,7 @@ fn a_second_arm_is_in_the_mask_and_its_joints_are_not_recorded() {
         items.filter(|i| i.kind == Kind::Robot).cloned().collect()
     };
     let shots: Vec<Shot> = (0..60)
-        .map(|id| stage.free_shot(1, id, 1).unwrap())
+        .flat_map(|id| stage.free_shots(1, id, 1, 1).unwrap())
         .collect();
     let counts: Vec<usize> = shots.iter().map(|shot| visible(shot).len()).collect();
     let one = counts.iter().copied().filter(|&c| c > 0).min().unwrap();
@@ -651,6 +651,7 @@ fn request(folder: &Path, out: &str) -> Request {
         samples: 6,
         seed: 3,
         protocol: Protocol::FreeCamera,
+        cameras: 1,
         out: folder.join(out),
     }
 }
@@ -833,6 +834,79 @@ fn a_fixed_camera_stays_where_it_is() {
     record(&device, &other, |_| {}).unwrap();
     let other = Reader::open(&other.out).unwrap();
     assert_ne!(other.samples()[0].camera_from_base, first.camera_from_base);
+}
+
+#[test]
+fn several_cameras_see_the_same_robot_at_the_same_time() {
+    let folder = TempDir::new().unwrap();
+    backgrounds(folder.path());
+    let device = common::device();
+    for (protocol, name) in [
+        (Protocol::FixedCamera, "fixed"),
+        (Protocol::FreeCamera, "free"),
+    ] {
+        let mut request = request(folder.path(), name);
+        request.protocol = protocol;
+        request.cameras = 3;
+        request.samples = 4;
+        record(&device, &request, |_| {}).unwrap();
+        let camera =
+            |number: u64| Reader::open(&request.out.join(format!("camera_{number}"))).unwrap();
+        let cameras: Vec<Reader> = (1..=3).map(camera).collect();
+        let mut robots = 0;
+        for (number, reader) in (1..).zip(&cameras) {
+            let source = &reader.header().source;
+            assert_eq!((source.camera, source.cameras), (Some(number), Some(3)));
+            assert_eq!(reader.samples().len(), 4);
+            for (sample, first) in reader.samples().iter().zip(cameras[0].samples()) {
+                reader.mask(sample).unwrap();
+                assert_eq!(sample.joint_angles_rad, first.joint_angles_rad);
+                robots += u64::from(sample.coverage > 0.0);
+                if number > 1 && sample.joint_angles_rad.is_some() {
+                    assert_ne!(sample.camera_from_base, first.camera_from_base);
+                }
+                // The same joints in the base frame, each camera's through its own pose.
+                let in_base = |sample: &Sample| -> Vec<DVec3> {
+                    let matrix = sample.camera_from_base.unwrap_or_default();
+                    let camera =
+                        DAffine3::from_mat4(glam::DMat4::from_cols_array(&matrix).transpose());
+                    let joints = sample.joints_m.iter().flatten();
+                    joints
+                        .map(|&j| camera.inverse().transform_point3(j.into()))
+                        .collect()
+                };
+                for (a, b) in in_base(sample).iter().zip(in_base(first)) {
+                    assert!(a.distance(b) < 1e-9);
+                }
+            }
+        }
+        assert!(robots >= 6, "{robots} robots are seen");
+
+        // One that was cut off goes on, whichever camera is behind.
+        let lines = request.out.join("camera_2/samples.jsonl");
+        let whole = fs::read_to_string(&lines).unwrap();
+        let picture = fs::read(request.out.join("camera_2/image/000003.jpg")).unwrap();
+        let cut = whole
+            .lines()
+            .take(3)
+            .map(|line| format!("{line}\n"))
+            .collect::<String>();
+        fs::write(&lines, cut + "{\"id\":3").unwrap();
+        record(&device, &request, |_| {}).unwrap();
+        assert_eq!(fs::read_to_string(&lines).unwrap(), whole);
+        assert_eq!(
+            fs::read(request.out.join("camera_2/image/000003.jpg")).unwrap(),
+            picture
+        );
+        assert_eq!(camera(1).samples().len(), 4);
+
+        request.cameras = 2;
+        let error = record(&device, &request, |_| {}).unwrap_err().to_string();
+        assert!(
+            error.contains("source.cameras: expected 2, found 3"),
+            "{error}"
+        );
+    }
 }
 
 #[test]

@@ -2,6 +2,7 @@
 
 mod adapters;
 mod bench;
+mod calibrate;
 mod engine;
 mod evaluate;
 mod info;
@@ -31,6 +32,7 @@ enum Command {
     Verify(verify::Args),
     Record(record::Args),
     Evaluate(evaluate::Args),
+    Calibrate(calibrate::Args),
     #[command(subcommand)]
     Recording(recording::Args),
 }
@@ -53,6 +55,7 @@ pub fn main() -> ExitCode {
         Command::Verify(args) => verify::run(&args),
         Command::Record(args) => record::run(args),
         Command::Evaluate(args) => evaluate::run(&args),
+        Command::Calibrate(args) => calibrate::run(&args),
         Command::Recording(args) => recording::run(&args),
     };
     done.unwrap_or_else(|error| {

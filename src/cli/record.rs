@@ -50,8 +50,12 @@ pub struct Args {
     /// A camera and a look of its own for each sample, some of them without the robot (the default)
     #[arg(long)]
     free_camera: bool,
+    /// How many cameras see each pose of the robot. Several make a recording each: camera_1, camera_2 and so
+    /// on in --out, whose samples of one number are of one instant
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=16))]
+    cameras: u64,
     /// The paper's nine recordings of UR3, UR5 and UR10 with fixed cameras: 4,350 samples
-    #[arg(long, conflicts_with_all = ["robot", "samples", "fixed_camera", "free_camera"])]
+    #[arg(long, conflicts_with_all = ["robot", "samples", "fixed_camera", "free_camera", "cameras"])]
     paper: bool,
 }
 
@@ -98,6 +102,7 @@ fn requests(args: Args) -> Result<Vec<Request>, String> {
         } else {
             Protocol::FreeCamera
         },
+        cameras: args.cameras,
         out: args.out,
     }])
 }

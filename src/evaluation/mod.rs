@@ -8,6 +8,7 @@ mod figures;
 mod measures;
 #[cfg(feature = "cli")]
 mod photo;
+mod rig;
 mod score;
 
 pub use error::{EvaluationError, NotFinite};
@@ -15,4 +16,5 @@ pub use figures::{Figures, JointFigures, MaskFigures, NamedJoint, Presence, Stat
 pub use measures::{MaskCounts, Summary, distances_cm, distances_px};
 #[cfg(feature = "cli")]
 pub use photo::{Annotation, JointMark, PhotoFigures, PhotoScore, Scene, read_annotations};
+pub use rig::{PoseFigures, RigFigures, RigFrame, TogetherFigures};
 pub use score::{BARELY_IN_VIEW, JointErrors, JointScore, Score, network_mask};

@@ -7,6 +7,7 @@
 mod config;
 mod engine;
 mod frame;
+mod fusion;
 mod input;
 mod lines;
 mod mailbox;
@@ -26,6 +27,7 @@ mod watch;
 pub use config::{CameraConfig, Config, ConfigError, KnownModel};
 pub use engine::{CpuEngine, Engine, GpuEngine, GpuOptions, IN_FLIGHT, OpenDevice};
 pub use frame::Frame;
+pub use fusion::{Fused, Fusion};
 pub use input::{Calibration, Input};
 pub use lines::{Lines, Named};
 pub use observation::{Event, EventKind, Observation, Rates, Sink, SinkError, Statistics};

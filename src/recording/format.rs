@@ -68,6 +68,13 @@ pub struct Source {
     /// ([`Protocol::FixedCamera`]).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub planned: Option<u64>,
+    /// Which camera this was, from 1, where several cameras saw the same robot at the same time, a recording
+    /// each: samples of one number are of one instant.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub camera: Option<u64>,
+    /// How many these were.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub cameras: Option<u64>,
 }
 
 /// Whether a recording was rendered.
@@ -218,11 +225,6 @@ impl Writer {
     /// The number of the sample to write next.
     pub fn next(&self) -> u64 {
         self.next
-    }
-
-    /// The folder written to.
-    pub fn folder(&self) -> &Path {
-        &self.folder
     }
 
     /// Adds a sample, whose pictures are already written. Samples come in order.

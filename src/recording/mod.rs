@@ -70,6 +70,9 @@ pub struct Request {
     pub seed: u64,
     /// How camera and robot move.
     pub protocol: Protocol,
+    /// How many cameras see each pose of the robot, 1 or more. Several make a recording each, with the same
+    /// robot at the same samples: `camera_1`, `camera_2` and so on in `out`.
+    pub cameras: u64,
     /// The recording's folder.
     pub out: PathBuf,
 }
@@ -107,6 +110,7 @@ pub fn paper_requests(
             samples,
             seed,
             protocol: Protocol::FixedCamera,
+            cameras: 1,
             out: out.join(format!("{robot}_{number}")),
         })
         .collect()
@@ -124,16 +128,109 @@ pub fn record(
 ) -> Result<(), RecordingError> {
     let backgrounds = Backgrounds::open(&request.backgrounds)?;
     let stage = Stage::load(&request.urdf, &request.packages, &request.bodies)?;
-    let header = Header {
+    let recordings: Vec<(PathBuf, Header)> = if request.cameras > 1 {
+        let folder = |camera| request.out.join(format!("camera_{camera}"));
+        (1..=request.cameras)
+            .map(|camera| (folder(camera), header(request, &stage, Some(camera))))
+            .collect()
+    } else {
+        vec![(request.out.clone(), header(request, &stage, None))]
+    };
+    if recordings
+        .iter()
+        .all(|(out, _)| out.join("recording.json").exists())
+    {
+        let done = next(&open(&recordings)?);
+        if done >= request.samples {
+            progress(done);
+            return Ok(());
+        }
+    }
+    let station = match request.protocol {
+        Protocol::FixedCamera => {
+            let samples = usize::try_from(request.samples).unwrap_or(usize::MAX);
+            Some(stage.station(request.seed, recordings.len(), samples)?)
+        }
+        Protocol::FreeCamera => None,
+    };
+    let renderer = Mutex::new(Renderer::new(device, stage.meshes())?);
+    let mut writers = open(&recordings)?;
+    progress(next(&writers));
+
+    let make = |id: u64| -> Result<Vec<Sample>, RecordingError> {
+        let photos = backgrounds.count();
+        let shots = match &station {
+            Some(station) => stage.fixed_shots(station, id, photos)?,
+            None => stage.free_shots(request.seed, id, recordings.len(), photos)?,
+        };
+        let draw = |(shot, (folder, _)): (&Shot, &(PathBuf, Header))| {
+            let background = backgrounds.view(&shot.background)?;
+            let texture = shot
+                .texture
+                .as_ref()
+                .map(|view| backgrounds.view(view))
+                .transpose()?;
+            let mut picture = renderer
+                .lock()
+                .unwrap_or_else(std::sync::PoisonError::into_inner)
+                .draw(&shot.scene, &background, texture.as_deref())?;
+            shot.effects.apply(&mut picture);
+            let sample = describe(id, shot, &picture);
+            write_picture(folder, &sample, &picture)?;
+            Ok(sample)
+        };
+        shots.iter().zip(&recordings).map(draw).collect()
+    };
+
+    // Each worker makes whole samples; only drawing is one at a time.
+    let workers = std::thread::available_parallelism().map_or(1, |n| n.get());
+    let upcoming = AtomicU64::new(next(&writers));
+    let stop = AtomicBool::new(false);
+    let (send, receive) = mpsc::sync_channel(workers);
+    std::thread::scope(|scope| {
+        for _ in 0..workers {
+            let (send, upcoming, stop, make) = (send.clone(), &upcoming, &stop, &make);
+            scope.spawn(move || {
+                while !stop.load(Ordering::Relaxed) {
+                    let id = upcoming.fetch_add(1, Ordering::Relaxed);
+                    if id >= request.samples || send.send((id, make(id))).is_err() {
+                        return;
+                    }
+                }
+            });
+        }
+        drop(send);
+        let mut waiting = BTreeMap::new();
+        let mut append = || {
+            for (id, samples) in &receive {
+                waiting.insert(id, samples?);
+                while let Some(samples) = waiting.remove(&next(&writers)) {
+                    for (writer, sample) in writers.iter_mut().zip(&samples) {
+                        // A recording that was cut off may be ahead of the others.
+                        if writer.next() == sample.id {
+                            writer.append(sample)?;
+                        }
+                    }
+                    progress(next(&writers));
+                }
+            }
+            Ok(())
+        };
+        let result = append();
+        stop.store(true, Ordering::Relaxed);
+        drop(receive);
+        result
+    })
+}
+
+/// The header of camera `camera`'s recording; `None` where there is one camera.
+fn header(request: &Request, stage: &Stage, camera: Option<u64>) -> Header {
+    let joints = stage.robot().joints.iter();
+    Header {
         format: format::FORMAT.into(),
         version: format::VERSION,
         robot: request.robot.clone(),
-        joints: stage
-            .robot()
-            .joints
-            .iter()
-            .map(|j| j.name.clone())
-            .collect(),
+        joints: joints.map(|j| j.name.clone()).collect(),
         width: WIDTH,
         height: HEIGHT,
         frame: format::FRAME.into(),
@@ -145,82 +242,22 @@ pub fn record(
             bodies: request.bodies.iter().map(|(_, b)| file_name(b)).collect(),
             protocol: Some(request.protocol),
             planned: (request.protocol == Protocol::FixedCamera).then_some(request.samples),
+            camera,
+            cameras: camera.map(|_| request.cameras),
         },
-    };
-    if request.out.join("recording.json").exists() {
-        let done = Writer::open(&request.out, &header)?.next();
-        if done >= request.samples {
-            progress(done);
-            return Ok(());
-        }
     }
-    let station = match request.protocol {
-        Protocol::FixedCamera => {
-            let samples = usize::try_from(request.samples).unwrap_or(usize::MAX);
-            Some(stage.station(request.seed, samples)?)
-        }
-        Protocol::FreeCamera => None,
-    };
-    let renderer = Mutex::new(Renderer::new(device, stage.meshes())?);
-    let mut writer = Writer::open(&request.out, &header)?;
-    let folder = writer.folder().to_owned();
-    progress(writer.next());
+}
 
-    let make = |id: u64| -> Result<Sample, RecordingError> {
-        let shot = match &station {
-            Some(station) => stage.fixed_shot(station, id, backgrounds.count())?,
-            None => stage.free_shot(request.seed, id, backgrounds.count())?,
-        };
-        let background = backgrounds.view(&shot.background)?;
-        let texture = shot
-            .texture
-            .as_ref()
-            .map(|view| backgrounds.view(view))
-            .transpose()?;
-        let mut picture = renderer
-            .lock()
-            .unwrap_or_else(std::sync::PoisonError::into_inner)
-            .draw(&shot.scene, &background, texture.as_deref())?;
-        shot.effects.apply(&mut picture);
-        let sample = describe(id, &shot, &picture);
-        write_picture(&folder, &sample, &picture)?;
-        Ok(sample)
-    };
+fn open(recordings: &[(PathBuf, Header)]) -> Result<Vec<Writer>, RecordingError> {
+    let writers = recordings.iter();
+    writers
+        .map(|(out, header)| Writer::open(out, header))
+        .collect()
+}
 
-    // Each worker makes whole samples; only drawing is one at a time.
-    let workers = std::thread::available_parallelism().map_or(1, |n| n.get());
-    let next = AtomicU64::new(writer.next());
-    let stop = AtomicBool::new(false);
-    let (send, receive) = mpsc::sync_channel(workers);
-    std::thread::scope(|scope| {
-        for _ in 0..workers {
-            let (send, next, stop, make) = (send.clone(), &next, &stop, &make);
-            scope.spawn(move || {
-                while !stop.load(Ordering::Relaxed) {
-                    let id = next.fetch_add(1, Ordering::Relaxed);
-                    if id >= request.samples || send.send((id, make(id))).is_err() {
-                        return;
-                    }
-                }
-            });
-        }
-        drop(send);
-        let mut waiting = BTreeMap::new();
-        let mut append = || {
-            for (id, sample) in &receive {
-                waiting.insert(id, sample?);
-                while let Some(sample) = waiting.remove(&writer.next()) {
-                    writer.append(&sample)?;
-                    progress(writer.next());
-                }
-            }
-            Ok(())
-        };
-        let result = append();
-        stop.store(true, Ordering::Relaxed);
-        drop(receive);
-        result
-    })
+/// The sample to write next: all recordings have those before it.
+fn next(writers: &[Writer]) -> u64 {
+    writers.iter().map(Writer::next).min().unwrap_or_default()
 }
 
 fn file_name(path: &Path) -> String {

@@ -294,6 +294,8 @@ pub(super) struct Builder {
     pub(super) items: Vec<Item>,
     /// The camera's place, base frame.
     pub(super) camera: DVec3,
+    /// The places of other cameras that see the same.
+    others: Vec<DVec3>,
     /// The arms as lines, base frame: things keep clear of them.
     pub(super) arms: Vec<Vec<DVec3>>,
 }
@@ -342,12 +344,19 @@ fn plain(albedo: [f32; 3]) -> Material {
 }
 
 impl Builder {
-    pub(super) fn new(camera_from_base: DAffine3) -> Builder {
+    /// `cameras_from_base`: all that see the scene; what is put before or behind the arm is so for the first.
+    pub(super) fn new(cameras_from_base: &[DAffine3]) -> Builder {
+        let mut places = cameras_from_base.iter().map(|c| c.inverse().translation);
         Builder {
             items: Vec::new(),
-            camera: camera_from_base.inverse().translation,
+            camera: places.next().unwrap_or_default(),
+            others: places.collect(),
             arms: Vec::new(),
         }
+    }
+
+    fn cameras(&self) -> impl Iterator<Item = DVec3> {
+        std::iter::once(self.camera).chain(self.others.iter().copied())
     }
 
     fn add(&mut self, mesh: usize, pose: DAffine3, size: DVec3, material: Material, kind: Kind) {
@@ -369,14 +378,16 @@ impl Builder {
         self.add(CYLINDER, pose, size, material, kind);
     }
 
-    /// Whether a ball is clear of the arms and the camera, and leaves most of the first arm in view.
+    /// Whether a ball is clear of the arms and the cameras, and leaves most of the first arm in view.
     fn clear(&self, centre: DVec3, radius: f64) -> bool {
         let far = |line: &Vec<DVec3>| line_distance(line, centre) > radius + 0.09;
         let first = self.arms.first().map_or(&[][..], Vec::as_slice);
-        let hides = |&&point: &&DVec3| line_distance(&[self.camera, point], centre) < radius;
         self.arms.iter().all(far)
-            && centre.distance(self.camera) > radius + 0.25
-            && 3 * first.iter().filter(hides).count() <= first.len()
+            && self.cameras().all(|camera| {
+                let hides = |&&point: &&DVec3| line_distance(&[camera, point], centre) < radius;
+                centre.distance(camera) > radius + 0.25
+                    && 3 * first.iter().filter(hides).count() <= first.len()
+            })
     }
 
     /// What a second arm stands on.
@@ -640,6 +651,7 @@ impl Builder {
                 .arms
                 .iter()
                 .flatten()
+                .chain(&self.others)
                 .map(|&p| turn.inverse() * p)
                 .collect();
             let camera = turn.inverse() * self.camera;

@@ -100,6 +100,19 @@ impl Robot {
     /// A file is missing or unreadable (the error names it), or the URDF has no revolute joint, or its
     /// joints do not form a tree.
     pub fn load(urdf: &Path, packages: &[(String, PathBuf)]) -> Result<Robot, RecordingError> {
+        Self::read(urdf, Some(packages))
+    }
+
+    /// Reads a URDF without its meshes: enough for kinematics.
+    ///
+    /// # Errors
+    /// As [`Robot::load`], but for meshes.
+    pub fn kinematics(urdf: &Path) -> Result<Robot, RecordingError> {
+        Self::read(urdf, None)
+    }
+
+    /// Without `packages` meshes are left alone.
+    fn read(urdf: &Path, packages: Option<&[(String, PathBuf)]>) -> Result<Robot, RecordingError> {
         let mut text = std::fs::read_to_string(urdf).map_err(RecordingError::io(urdf))?;
         // Drake's attributes mostly come without the declaration that XML wants.
         if text.contains(" drake:") && !text.contains("xmlns:drake") {
@@ -121,11 +134,15 @@ impl Robot {
         for link in &description.links {
             let files = Files {
                 urdf,
-                packages,
+                packages: packages.unwrap_or_default(),
                 link: &link.name,
             };
+            let (seen, solid) = match packages {
+                Some(_) => (link.visual.as_slice(), link.collision.as_slice()),
+                None => Default::default(),
+            };
             let mut visual = Vec::new();
-            for part in &link.visual {
+            for part in seen {
                 let mut meshes = files.geometry(&part.geometry, &part.origin)?;
                 let colour = part.material.as_ref().and_then(|m| {
                     let named = description.materials.iter().find(|d| d.name == m.name);
@@ -142,7 +159,7 @@ impl Robot {
                 visual.append(&mut meshes);
             }
             let mut collision = Vec::new();
-            for part in &link.collision {
+            for part in solid {
                 collision.append(&mut files.geometry(&part.geometry, &part.origin)?);
             }
             if collision.is_empty() {
@@ -318,6 +335,11 @@ impl Robot {
             let point = pose.transform_point3(joint.axis * joint.offset);
             (point, pose.transform_vector3(joint.axis))
         })
+    }
+
+    /// The link whose frame is the base frame.
+    pub fn base_frame(&self) -> &str {
+        self.links.get(self.frame).map_or("", |link| &link.name)
     }
 
     /// The link that carries the first moving joint.

@@ -92,6 +92,14 @@ struct Arm<'a> {
     poses: Vec<DAffine3>,
 }
 
+/// One camera's view of a scene.
+struct View {
+    camera_from_base: DAffine3,
+    window: Window,
+    /// What it is drawn from; `None` for the first camera.
+    rng: Option<ChaCha8Rng>,
+}
+
 /// A robot ready to be put into scenes.
 pub struct Stage {
     meshes: Vec<Mesh>,
@@ -99,9 +107,9 @@ pub struct Stage {
     others: Vec<Body>,
 }
 
-/// A recording with a fixed camera: what stays the same, and the robot's poses.
+/// A recording with fixed cameras: what stays the same, and the robot's poses.
 pub struct Station {
-    camera_from_base: DAffine3,
+    cameras_from_base: Vec<DAffine3>,
     seed: u64,
     poses: Vec<Vec<f64>>,
 }
@@ -272,20 +280,34 @@ impl Stage {
             .unwrap_or(&self.main)
     }
 
-    /// Sample `id` of a recording with a free camera: the same for the same `seed` and `id`.
-    /// `photos`: how many background photos there are.
+    /// Sample `id` of a recording with free cameras, a shot a camera of one scene: the same for the same
+    /// `seed`, `id` and `cameras`. `photos`: how many background photos there are.
     ///
     /// # Errors
-    /// No pose and camera that keep the rules were found.
-    pub fn free_shot(&self, seed: u64, id: u64, photos: usize) -> Result<Shot, RecordingError> {
+    /// No pose and cameras that keep the rules were found.
+    pub fn free_shots(
+        &self,
+        seed: u64,
+        id: u64,
+        cameras: usize,
+        photos: usize,
+    ) -> Result<Vec<Shot>, RecordingError> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         rng.set_stream(id);
         let mut look = ChaCha8Rng::from_rng(&mut rng);
         let support = Support::any(&mut look);
         let window = Window::any(&mut look);
+        let mut views = vec![View::new(window)];
+        // A recording of one camera draws nothing for others.
+        for number in 1..cameras as u64 {
+            views.push(View::another(seed, id, number));
+        }
         if rng.random_bool(0.15) {
-            let camera = self.look_around(&support, &mut rng);
-            return Ok(self.dress(camera, window, support, &[], &mut look, &mut rng, photos));
+            for view in &mut views {
+                let rng = view.rng.as_mut().unwrap_or(&mut rng);
+                view.camera_from_base = self.look_around(&support, rng);
+            }
+            return Ok(self.dress(views, support, &[], &mut look, &mut rng, photos));
         }
         let body = self.any_body(&mut rng);
         for _ in 0..100 {
@@ -296,75 +318,105 @@ impl Stage {
                 let Some(camera) = self.aim(&arm, &support, &window, &mut rng) else {
                     continue;
                 };
+                let aimed = views.iter_mut().all(|view| match &mut view.rng {
+                    None => {
+                        view.camera_from_base = camera;
+                        true
+                    }
+                    Some(rng) => {
+                        let mut tries =
+                            (0..40).map(|_| self.aim(&arm, &support, &view.window, rng));
+                        let found = tries.find_map(|camera| camera);
+                        view.camera_from_base = found.unwrap_or_default();
+                        found.is_some()
+                    }
+                });
+                if !aimed {
+                    continue;
+                }
                 let second = if rng.random_bool(0.14) {
                     self.second(&arm, camera, &window, &mut rng)
                 } else {
                     None
                 };
                 let arms: Vec<Arm> = std::iter::once(arm).chain(second).collect();
-                return Ok(self.dress(camera, window, support, &arms, &mut look, &mut rng, photos));
+                return Ok(self.dress(views, support, &arms, &mut look, &mut rng, photos));
             }
         }
         Err(RecordingError::NoScene { id })
     }
 
-    /// Sample `id` of a recording with a fixed camera: the photo behind the robot and the light are the
-    /// sample's own, all else is the station's.
+    /// Sample `id` of a recording with fixed cameras, a shot a camera: the photos behind the robot and the
+    /// light are the sample's own, all else is the station's.
     ///
     /// # Errors
     /// The station has fewer samples.
-    pub fn fixed_shot(
+    pub fn fixed_shots(
         &self,
         station: &Station,
         id: u64,
         photos: usize,
-    ) -> Result<Shot, RecordingError> {
+    ) -> Result<Vec<Shot>, RecordingError> {
         let pose = usize::try_from(id).ok().and_then(|i| station.poses.get(i));
         let Some(angles) = pose else {
             return Err(RecordingError::NoScene { id });
         };
         let arm = self.main.arm(angles.clone());
-        let camera_from_base = station.camera_from_base;
         let mut rng = ChaCha8Rng::seed_from_u64(station.seed);
         rng.set_stream(id);
         let mut look = station_rng(station.seed);
         let support = Support::any(&mut look);
-        let mut build = Builder::new(camera_from_base);
+        let mut build = Builder::new(&station.cameras_from_base);
         support.build(&mut build, &mut look);
         let texture = PhotoView::any(&mut look, photos, false);
         // Last, as poses that leave no room for a tool draw less.
         let centre = put_arm(&mut build, &arm, &support, &mut look);
         let textured = build.items.iter().any(|item| item.material.photo > 0.0);
-        Ok(Shot {
-            scene: Scene {
-                camera_from_base,
-                items: build.items,
-                lighting: lighting(&mut rng),
-                centre,
-            },
-            background: PhotoView::any(&mut rng, photos, true),
-            texture: textured.then_some(texture),
-            effects: Effects::any(&mut rng, Window::WHOLE),
-            robot: Some(arm.posed(camera_from_base)),
-        })
+        let lighting = lighting(&mut rng);
+        let cameras = station.cameras_from_base.iter();
+        Ok(cameras
+            .map(|&camera_from_base| Shot {
+                scene: Scene {
+                    camera_from_base,
+                    items: build.items.clone(),
+                    lighting: lighting.clone(),
+                    centre,
+                },
+                background: PhotoView::any(&mut rng, photos, true),
+                texture: textured.then_some(texture.clone()),
+                effects: Effects::any(&mut rng, Window::WHOLE),
+                robot: Some(arm.posed(camera_from_base)),
+            })
+            .collect())
     }
 
-    /// The camera and the `samples` poses of a recording with a fixed camera (the paper, section 2): all
+    /// The cameras and the `samples` poses of a recording with fixed cameras (the paper, section 2): all
     /// joints are swept through their ranges in equal steps, in combination, and poses in which the robot
-    /// meets itself or the floor, or has a joint outside the picture, are left out. The more samples,
+    /// meets itself or the floor, or has a joint outside one of the pictures, are left out. The more samples,
     /// the finer the steps.
     ///
-    /// The camera is one that shows the robot whole and on 6 to 17 % of the picture (the paper, section 3)
-    /// in as many poses as possible.
+    /// Each camera is one that shows the robot whole and on 6 to 17 % of the picture (the paper, section 3)
+    /// in as many poses as possible; cameras look from directions that are 30 degrees apart or more.
     ///
     /// # Errors
     /// There are not as many such poses.
-    pub fn station(&self, seed: u64, samples: usize) -> Result<Station, RecordingError> {
-        let camera_from_base = self.station_camera(seed);
+    pub fn station(
+        &self,
+        seed: u64,
+        cameras: usize,
+        samples: usize,
+    ) -> Result<Station, RecordingError> {
+        let mut cameras_from_base: Vec<DAffine3> = Vec::new();
+        for _ in 0..cameras {
+            let camera = self.station_camera(seed, &cameras_from_base);
+            cameras_from_base.push(camera);
+        }
         let kept = |sweep: &Sweep| -> Vec<Vec<f64>> {
             let keep = |point: usize| {
                 let arm = self.main.arm(sweep.angles(point));
-                let seen = arm.in_view(camera_from_base, &Window::WHOLE) >= Some(arm.joints());
+                let seen = cameras_from_base
+                    .iter()
+                    .all(|&camera| arm.in_view(camera, &Window::WHOLE) >= Some(arm.joints()));
                 (seen && arm.is_free()).then_some(arm.angles)
             };
             (0..sweep.len()).into_par_iter().filter_map(keep).collect()
@@ -391,17 +443,28 @@ impl Stage {
         log::debug!("{} of {} poses of the sweep kept", poses.len(), sweep.len());
         let evenly = |i: usize| poses.get(i * poses.len() / samples).cloned();
         Ok(Station {
-            camera_from_base,
+            cameras_from_base,
             seed,
             poses: (0..samples).filter_map(evenly).collect(),
         })
     }
 
-    fn station_camera(&self, seed: u64) -> DAffine3 {
+    /// A camera beside `others`.
+    fn station_camera(&self, seed: u64, others: &[DAffine3]) -> DAffine3 {
         const CAMERAS: usize = 100;
         const POSES: usize = 60;
         let mut rng = station_rng(seed);
         let support = Support::any(&mut rng.clone());
+        if !others.is_empty() {
+            rng.set_stream(u64::MAX - others.len() as u64);
+        }
+        let apart = |camera: DAffine3| {
+            let forward = |camera: DAffine3| camera.matrix3.row(2);
+            let others = others.iter().map(|&other| forward(other));
+            others
+                .map(|other| other.angle_between(forward(camera)))
+                .fold(PI, f64::min)
+        };
         let sweep = Sweep::new(&self.main.robot, 10 * POSES);
         let poses: Vec<Arm> = (0..sweep.len())
             .step_by(sweep.len().div_ceil(5 * POSES))
@@ -420,6 +483,9 @@ impl Stage {
             let aim = DVec3::new(0.0, 0.0, self.main.reach * rng.random_range(0.2..0.6));
             let pixel = [INTRINSICS.cx, INTRINSICS.cy + rng.random_range(-20.0..20.0)];
             let camera = look_at(aim, direction, distance, 0.0, pixel);
+            if apart(camera) < PI / 6.0 {
+                continue;
+            }
             // What is seen at another size counts against the camera.
             let whole = &Window::WHOLE;
             let score: f64 = poses
@@ -572,20 +638,19 @@ impl Stage {
         look_at(aim, direction, distance, roll, pixel)
     }
 
-    /// Puts everything into a shot. `arms`: the robot, then others. `look` draws what a recording with a
-    /// fixed camera keeps: support, colours, tool.
-    #[expect(clippy::too_many_arguments)]
+    /// Puts everything into a scene, and takes a shot of it a view. `arms`: the robot, then others. `look`
+    /// draws what a recording with a fixed camera keeps: support, colours, tool.
     fn dress(
         &self,
-        camera_from_base: DAffine3,
-        window: Window,
+        views: Vec<View>,
         support: Support,
         arms: &[Arm],
         look: &mut ChaCha8Rng,
         rng: &mut ChaCha8Rng,
         photos: usize,
-    ) -> Shot {
-        let mut build = Builder::new(camera_from_base);
+    ) -> Vec<Shot> {
+        let cameras: Vec<DAffine3> = views.iter().map(|view| view.camera_from_base).collect();
+        let mut build = Builder::new(&cameras);
         let mut centre = DVec3::new(0.0, 0.0, 0.3);
         let bare = arms.is_empty() && look.random_bool(0.4);
         let floor = if bare {
@@ -615,17 +680,46 @@ impl Stage {
         }
         let texture = PhotoView::any(rng, photos, false);
         let textured = build.items.iter().any(|item| item.material.photo > 0.0);
-        Shot {
-            scene: Scene {
-                camera_from_base,
-                items: build.items,
-                lighting: lighting(rng),
-                centre,
-            },
-            background: PhotoView::any(rng, photos, true),
-            texture: textured.then_some(texture),
-            effects: Effects::any(rng, window),
-            robot: arms.first().map(|arm| arm.posed(camera_from_base)),
+        let lighting = lighting(rng);
+        let mut shots = Vec::with_capacity(views.len());
+        for mut view in views {
+            let rng = view.rng.as_mut().unwrap_or(rng);
+            shots.push(Shot {
+                scene: Scene {
+                    camera_from_base: view.camera_from_base,
+                    items: build.items.clone(),
+                    lighting: lighting.clone(),
+                    centre,
+                },
+                background: PhotoView::any(rng, photos, true),
+                texture: textured.then_some(texture.clone()),
+                effects: Effects::any(rng, view.window),
+                robot: arms.first().map(|arm| arm.posed(view.camera_from_base)),
+            });
+        }
+        shots
+    }
+}
+
+impl View {
+    /// The first camera's, which is drawn together with the scene.
+    fn new(window: Window) -> Self {
+        Self {
+            camera_from_base: DAffine3::IDENTITY,
+            window,
+            rng: None,
+        }
+    }
+
+    /// That of camera `number`, which is drawn on its own.
+    fn another(seed: u64, id: u64, number: u64) -> Self {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        // Ids fill the streams from below, stations from above.
+        rng.set_stream((number << 48) ^ id);
+        Self {
+            window: Window::any(&mut rng),
+            rng: Some(rng),
+            ..Self::new(Window::WHOLE)
         }
     }
 }

@@ -2,6 +2,7 @@
 
 mod pictures;
 mod report;
+mod rig;
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -17,7 +18,7 @@ use super::engine::{self, PrecisionName};
 use super::{locate, photo};
 use crate::camera::{Camera, Distortion};
 use crate::cascade::{Locator, Output, Status};
-use crate::evaluation::{Annotation, PhotoScore, Score, read_annotations};
+use crate::evaluation::{Annotation, PhotoScore, RigFigures, Score, read_annotations};
 use crate::network::Model;
 use crate::recording::{Reader, Sample};
 use report::Report;
@@ -28,7 +29,7 @@ use report::Report;
 /// each photo is judged with the weights of its robot. Exits with 0 if all was judged, however good; with
 /// 1 if something could not be read or judged; with 2 on wrong usage.
 #[derive(Debug, clap::Args)]
-#[command(group(ArgGroup::new("subject").required(true).multiple(true).args(["recording", "photos", "without"])))]
+#[command(group(ArgGroup::new("subject").required(true).multiple(true).args(["recording", "photos", "without", "rig"])))]
 pub struct Args {
     /// Recordings to judge
     #[arg(long, value_name = "DIR", num_args(1..))]
@@ -48,6 +49,10 @@ pub struct Args {
     /// Folders of photos without the robot: how often is it found all the same?
     #[arg(long, value_name = "DIR", num_args(1..))]
     without: Vec<PathBuf>,
+    /// Recordings of several cameras at once (`whereabot record --cameras`): how well do the joints tell where the
+    /// cameras are, and how much better are the joints of several?
+    #[arg(long, value_name = "DIR", num_args(1..))]
+    rig: Vec<PathBuf>,
     /// Draw charts and sheets of pictures (PNG) into this folder
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
@@ -130,6 +135,14 @@ struct WithoutRobot {
     found: Vec<PathBuf>,
 }
 
+/// Cameras that saw a robot at the same time, and what their model made of it.
+struct RigScores {
+    folder: PathBuf,
+    /// Which model.
+    by: usize,
+    figures: RigFigures,
+}
+
 /// Everything that was judged.
 struct Results {
     split: Split,
@@ -137,6 +150,7 @@ struct Results {
     recordings: Vec<RecordingScores>,
     photos: Vec<JudgedPhoto>,
     without: Vec<WithoutRobot>,
+    rigs: Vec<RigScores>,
 }
 
 /// Runs the command.
@@ -158,13 +172,20 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         without.push((folder, images));
     }
 
+    let rigs = args
+        .rig
+        .iter()
+        .map(|folder| rig::open(folder, &models))
+        .collect::<anyhow::Result<Vec<_>>>()?;
+
     let samples = |r: &RecordingScores| -> usize {
         let samples = r.reader.samples().iter();
         samples.filter(|sample| args.split.has(sample)).count()
     };
     let images = recordings.iter().map(samples).sum::<usize>()
         + photos.len()
-        + models.len() * without.iter().map(|(_, i)| i.len()).sum::<usize>();
+        + models.len() * without.iter().map(|(_, i)| i.len()).sum::<usize>()
+        + rigs.iter().map(rig::OpenRig::images).sum::<usize>();
     let bar = locate::progress_bar(images);
     let mut models = models;
     for recording in &mut recordings {
@@ -197,6 +218,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             })
         })
         .collect::<anyhow::Result<Vec<_>>>()?;
+    let rigs = rigs
+        .into_iter()
+        .map(|rig| rig::judge(rig, &mut models, &bar))
+        .collect::<anyhow::Result<Vec<_>>>()?;
     bar.finish_and_clear();
 
     let mut results = Results {
@@ -205,6 +230,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         recordings,
         photos,
         without,
+        rigs,
     };
     let report = Report::new(&results);
     let text = if args.json {
@@ -302,8 +328,8 @@ fn open(folder: &Path, models: &[Judged], split: Split) -> anyhow::Result<Record
     })
 }
 
-/// A sample's picture, mask and camera.
-fn read(reader: &Reader, sample: &Sample) -> anyhow::Result<(RgbaImage, GrayImage, Camera)> {
+/// A sample's picture and camera.
+fn picture(reader: &Reader, sample: &Sample) -> anyhow::Result<(RgbaImage, Camera)> {
     let image = image::DynamicImage::from(reader.image(sample)?).into_rgba8();
     let camera = Camera {
         width: image.width(),
@@ -311,6 +337,12 @@ fn read(reader: &Reader, sample: &Sample) -> anyhow::Result<(RgbaImage, GrayImag
         intrinsics: sample.intrinsics,
         distortion: Distortion::None,
     };
+    Ok((image, camera))
+}
+
+/// A sample's picture, mask and camera.
+fn read(reader: &Reader, sample: &Sample) -> anyhow::Result<(RgbaImage, GrayImage, Camera)> {
+    let (image, camera) = picture(reader, sample)?;
     Ok((image, reader.mask(sample)?, camera))
 }
 

@@ -5,9 +5,11 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::{JudgedPhoto, RecordingScores, Results, Split};
+use super::{JudgedPhoto, RecordingScores, Results, RigScores, Split};
 use crate::cascade::Status;
-use crate::evaluation::{BARELY_IN_VIEW, Figures, JointFigures, PhotoFigures, Score, Summary};
+use crate::evaluation::{
+    BARELY_IN_VIEW, Figures, JointFigures, PhotoFigures, RigFigures, Score, Summary,
+};
 use crate::recording::{Protocol, SourceKind};
 
 /// The version of the JSON.
@@ -27,6 +29,17 @@ pub struct Report {
     #[serde(skip_serializing_if = "Option::is_none")]
     photos: Option<PhotosLine>,
     without: Vec<WithoutLine>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    rigs: Vec<RigLine>,
+}
+
+#[derive(Serialize)]
+struct RigLine {
+    rig: String,
+    robot: String,
+    weights: String,
+    #[serde(flatten)]
+    figures: RigFigures,
 }
 
 #[derive(Serialize)]
@@ -111,6 +124,7 @@ impl Report {
             recordings,
             photos,
             without,
+            rigs,
         } = results;
         let adapter = models.first().map(|m| m.locator.adapter_name().to_owned());
         let figures = |by: usize, of: &[&RecordingScores]| -> Figures {
@@ -181,6 +195,15 @@ impl Report {
                     images: w.images,
                     found: w.found.iter().map(|path| named(path)).collect(),
                     found_share: w.found.len() as f64 / w.images as f64,
+                })
+                .collect(),
+            rigs: rigs
+                .iter()
+                .map(|r: &RigScores| RigLine {
+                    rig: named(&r.folder),
+                    robot: models[r.by].robot().to_owned(),
+                    weights: named(&models[r.by].file),
+                    figures: r.figures.clone(),
                 })
                 .collect(),
         }
@@ -500,6 +523,77 @@ impl Report {
     }
 }
 
+impl RigLine {
+    fn write(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let figures = &self.figures;
+        let found: Vec<String> = figures.found.iter().map(usize::to_string).collect();
+        writeln!(
+            f,
+            "\n{}: {}, {} cameras, {} instants, found in {}, by {}",
+            self.rig,
+            self.robot,
+            figures.found.len(),
+            figures.instants,
+            found.join(", "),
+            self.weights
+        )?;
+        writeln!(
+            f,
+            "\nA camera's pose in the base frame, by the joints of so many frames: how far it is off (median, 95th \
+             percentile), and the standard deviation that was stated (median)"
+        )?;
+        let mut rows = vec![row([
+            "frames",
+            "tries",
+            "not told",
+            "place, cm",
+            "95 %",
+            "stated",
+            "turn, degrees",
+            "95 %",
+            "stated",
+        ])];
+        rows.extend(figures.poses.iter().map(|line| {
+            let median = |summary: Option<Summary>| number(summary.map(|s| s.median), 1);
+            let p95 = |summary: Option<Summary>| number(summary.map(|s| s.p95), 1);
+            vec![
+                line.frames.map_or("all".into(), |n| n.to_string()),
+                line.tries.to_string(),
+                line.undetermined.to_string(),
+                median(line.place_cm),
+                p95(line.place_cm),
+                median(line.place_sigma_cm),
+                median(line.turn_deg),
+                p95(line.turn_deg),
+                median(line.turn_sigma_deg),
+            ]
+        }));
+        write_table(f, &rows)?;
+        writeln!(
+            f,
+            "\nJoint error by so many cameras together, cm: mean, median, 95th percentile over instants, in the first \
+             camera's frame (nothing known of the cameras before), and in the base frame (cameras calibrated by the \
+             joint angles of the first half; judged on the second)"
+        )?;
+        let mut rows = vec![row([
+            "cameras",
+            "first camera's: mean",
+            "median",
+            "95 %",
+            "base: mean",
+            "median",
+            "95 %",
+        ])];
+        rows.extend(figures.together.iter().map(|line| {
+            let mut cells = vec![line.cameras.to_string()];
+            cells.extend(three(line.first_camera_cm));
+            cells.extend(three(line.base_cm));
+            cells
+        }));
+        write_table(f, &rows)
+    }
+}
+
 /// A block of rows a subject: all joints, then each.
 fn joint_rows(
     subjects: &[(String, &Figures)],
@@ -567,6 +661,9 @@ impl fmt::Display for Report {
             for file in self.without.iter().flat_map(|line| &line.found) {
                 writeln!(f, "  {file}")?;
             }
+        }
+        for rig in &self.rigs {
+            rig.write(f)?;
         }
         writeln!(f, "\nrun on {}", self.adapter)
     }
