@@ -42,7 +42,7 @@ fn two_cameras_of_a_robot_become_one_view() {
         DAffine3::from_rotation_translation(DQuat::from_rotation_y(1.0), DVec3::new(1.0, 0.0, 1.0));
     let run = |smoothing_s, cameras: [usize; 2]| {
         let mut all = Vec::new();
-        let mut sink = Fusion::new(&cameras, RigOptions::default(), smoothing_s, |f| {
+        let mut sink = Fusion::new(0, &cameras, RigOptions::default(), smoothing_s, |f| {
             all.push(f)
         });
         for n in 0..20_u64 {

@@ -21,8 +21,8 @@ use crate::live::mcap::{RecordedCamera, Recorder};
 use crate::live::page::{self, CameraInfo};
 use crate::live::warning::{Warnings, uncertainty_m};
 use crate::live::{
-    Calibration, CameraConfig, Config, CpuEngine, Engine, Event, GpuEngine, GpuOptions, KnownModel,
-    Lines, Location, Named, Sink, Stop, watch,
+    Calibration, CameraConfig, Config, CpuEngine, Engine, Fusion, GpuEngine, GpuOptions,
+    KnownModel, Lines, Location, Named, NamedRig, Sink, Stop, Word, watch,
 };
 use crate::network::{Description, Model};
 
@@ -85,8 +85,8 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
         }
     }
     let stop = Arc::new(Stop::default());
-    let (emit, emitted) = mpsc::channel();
-    let mut sinks = sinks(&args, &config, &models, emit, &stop)?;
+    let (say, words) = mpsc::channel();
+    let mut sinks = sinks(&args, &config, &models, &say, &stop)?;
     // Open until the end.
     let page = page(&args, cameras, &models)?;
     sinks.extend(page.iter().map(|page| Box::new(page.sink()) as _));
@@ -95,7 +95,7 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
     stop_on_signals(&stop).context("signals cannot be handled")?;
     let inputs = cameras.iter().map(CameraConfig::input).collect();
     let mut done = ExitCode::SUCCESS;
-    for error in watch(inputs, engine, sinks, emitted, &stop) {
+    for error in watch(inputs, engine, sinks, words, &stop) {
         log::error!("{error}");
         done = ExitCode::FAILURE;
     }
@@ -125,7 +125,7 @@ fn sinks(
     args: &Args,
     config: &Config,
     models: &Models,
-    emit: Sender<Event>,
+    say: &Sender<Word>,
     stop: &Arc<Stop>,
 ) -> anyhow::Result<Vec<Box<dyn Sink>>> {
     let cameras = &config.cameras;
@@ -141,11 +141,28 @@ fn sinks(
         // The reader, such as `head`, has what it wanted.
         closed.set();
     });
+    let rigs = config.rigs.iter().map(|rig| {
+        let first = rig.cameras.first().and_then(|&first| cameras.get(first));
+        let description = first.and_then(|first| models.description(first.robot.place));
+        NamedRig {
+            rig: rig.name.clone(),
+            cameras: rig.cameras.clone(),
+            joints: description.map_or_else(Vec::new, |of| of.joints.clone()),
+        }
+    });
+    let lines = lines.with_rigs(rigs.collect());
     let mut sinks: Vec<Box<dyn Sink>> = vec![Box::new(lines)];
+    for (number, rig) in config.rigs.iter().enumerate() {
+        let say = say.clone();
+        let fused = move |fused| drop(say.send(Word::Fused(fused)));
+        let fusion = Fusion::new(number, &rig.cameras, rig.options, rig.smoothing_s, fused);
+        sinks.push(Box::new(fusion));
+    }
     if !config.warnings.rules.is_empty() {
         let observers: Vec<_> = cameras.iter().map(CameraConfig::observer).collect();
+        let say = say.clone();
         // Nobody listens any more at the end.
-        let emit = move |event| drop(emit.send(event));
+        let emit = move |event| drop(say.send(Word::Event(event)));
         sinks.push(Box::new(Warnings::start(
             &config.warnings,
             &observers,
@@ -216,6 +233,7 @@ fn config(args: &Args, models: &mut Models) -> anyhow::Result<Config> {
     });
     Ok(Config {
         cameras: cameras.collect::<anyhow::Result<_>>()?,
+        rigs: Vec::new(),
         warnings: Default::default(),
     })
 }

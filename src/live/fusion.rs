@@ -9,6 +9,8 @@ use crate::cascade::Status;
 /// The robot's joints as all cameras together see them, after a frame of one of them.
 #[derive(Debug, Clone)]
 pub struct Fused {
+    /// The rig's place in the configuration.
+    pub rig: usize,
     /// When the frame was taken, seconds since 1970 by the wall clock.
     pub time_s: f64,
     /// The robot's joints, in the model's order and in the first camera's optical frame; smoothed where that is asked
@@ -22,6 +24,7 @@ pub struct Fused {
 ///
 /// It costs some milliseconds now and then, when it looks for the cameras' places anew.
 pub struct Fusion<F> {
+    number: usize,
     /// Each camera's place in the rig, by its place in the configuration.
     places: Vec<Option<usize>>,
     rig: Rig,
@@ -30,12 +33,19 @@ pub struct Fusion<F> {
 }
 
 impl<F: FnMut(Fused) + Send> Fusion<F> {
-    /// `cameras`: the places in the configuration of those that watch this robot, the one whose frame all is in first.
+    /// `number`: the rig's place in the configuration. `cameras`: the places in the configuration of those that watch this robot, the one whose frame all is in first.
     /// `smoothing_s`: a time constant and lag, none by default ([`Smoother`]). `fused` hears what comes out.
-    pub fn new(cameras: &[usize], options: RigOptions, smoothing_s: Option<f64>, fused: F) -> Self {
+    pub fn new(
+        number: usize,
+        cameras: &[usize],
+        options: RigOptions,
+        smoothing_s: Option<f64>,
+        fused: F,
+    ) -> Self {
         let most = cameras.iter().max().map_or(0, |most| most + 1);
         let place = |camera| cameras.iter().position(|&c| c == camera);
         Self {
+            number,
             places: (0..most).map(place).collect(),
             rig: Rig::new(cameras.len(), options),
             smoother: smoothing_s.map(Smoother::new),
@@ -70,6 +80,7 @@ impl<F: FnMut(Fused) + Send> Sink for Fusion<F> {
             }
         }
         (self.fused)(Fused {
+            rig: self.number,
             time_s,
             joints,
             poses: self.rig.poses(),

@@ -4,10 +4,11 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, channel, sync_channel};
 use std::time::{Duration, SystemTime};
 
+use glam::DMat3;
 use serde::Serialize;
 
 use super::warning::{ActionReport, Warning};
-use super::{Event, EventKind, Observation, Rates, Sink, Statistics};
+use super::{Event, EventKind, Fused, Observation, Rates, Sink, Statistics};
 use crate::cascade::EstimateLine;
 
 /// JSON Lines: a result a camera a frame, events, and a line of statistics a second. `README.md` lists the keys.
@@ -16,6 +17,7 @@ use crate::cascade::EstimateLine;
 /// and the next line of statistics says how many.
 pub struct Lines {
     cameras: Vec<Named>,
+    rigs: Vec<NamedRig>,
     lines: Option<SyncSender<String>>,
     /// Hangs up when all lines are written.
     written: Receiver<()>,
@@ -29,6 +31,17 @@ pub struct Named {
     pub camera: String,
     /// The robot in its view.
     pub robot: String,
+}
+
+/// What lines say of a rig.
+#[derive(Debug, Clone)]
+pub struct NamedRig {
+    /// Its name.
+    pub rig: String,
+    /// The places of its cameras in the configuration, the one whose frame all is in first.
+    pub cameras: Vec<usize>,
+    /// The joints' names, in the model's order.
+    pub joints: Vec<String>,
 }
 
 /// The version of the lines.
@@ -63,11 +76,36 @@ enum Content<'a> {
         #[serde(flatten)]
         details: Details<'a>,
     },
+    Fused {
+        rig: &'a str,
+        acquired_s: f64,
+        frame: &'static str,
+        of: &'a str,
+        joints: Vec<FusedJointLine<'a>>,
+        cameras: Vec<PoseLine<'a>>,
+    },
     Statistics {
         at_s: f64,
         lines_lost: u64,
         cameras: Vec<CameraRates<'a>>,
     },
+}
+
+#[derive(Serialize)]
+struct FusedJointLine<'a> {
+    name: &'a str,
+    xyz_m: [f64; 3],
+    /// Standard deviation along each axis.
+    sigma_m: [f64; 3],
+    cameras: usize,
+}
+
+/// Where a camera is in the first one's frame.
+#[derive(Serialize)]
+struct PoseLine<'a> {
+    camera: &'a str,
+    translation_m: [f64; 3],
+    rotation_xyzw: [f64; 4],
 }
 
 /// What there is to say of an event besides its name.
@@ -125,10 +163,18 @@ impl Lines {
         });
         Self {
             cameras,
+            rigs: Vec::new(),
             lines: Some(lines),
             written,
             lost: Arc::default(),
         }
+    }
+
+    /// Writes what the cameras of these rigs see together, too.
+    #[must_use]
+    pub fn with_rigs(mut self, rigs: Vec<NamedRig>) -> Self {
+        self.rigs = rigs;
+        self
     }
 
     fn name(&self, camera: usize) -> &str {
@@ -199,6 +245,41 @@ impl Sink for Lines {
         );
     }
 
+    fn fused(&mut self, fused: &Fused) {
+        let Some(rig) = self.rigs.get(fused.rig) else {
+            return;
+        };
+        let joints = fused.joints.iter().zip(&rig.joints);
+        let joints = joints.map(|(joint, name)| FusedJointLine {
+            name,
+            xyz_m: joint.xyz_m.to_array(),
+            sigma_m: diagonal(joint.covariance).map(f64::sqrt),
+            cameras: joint.cameras,
+        });
+        let poses = fused.poses.iter().zip(&rig.cameras);
+        let poses = poses.filter_map(|(pose, &camera)| {
+            let (_, rotation, translation) =
+                (*pose)?.first_from_camera.to_scale_rotation_translation();
+            Some(PoseLine {
+                camera: self.name(camera),
+                translation_m: translation.to_array(),
+                rotation_xyzw: rotation.to_array(),
+            })
+        });
+        let first = rig.cameras.first().map_or("", |&first| self.name(first));
+        self.write(
+            "fused",
+            Content::Fused {
+                rig: &rig.rig,
+                acquired_s: fused.time_s,
+                frame: "camera_optical",
+                of: first,
+                joints: joints.collect(),
+                cameras: poses.collect(),
+            },
+        );
+    }
+
     fn statistics(&mut self, statistics: &Statistics) {
         let cameras = statistics.cameras.iter().zip(&self.cameras);
         let cameras = cameras.map(|(rates, named)| CameraRates::new(&named.camera, rates));
@@ -233,6 +314,10 @@ impl<'a> CameraRates<'a> {
             age_p99_ms: rates.age_p99.map(milliseconds),
         }
     }
+}
+
+fn diagonal(matrix: DMat3) -> [f64; 3] {
+    [matrix.x_axis.x, matrix.y_axis.y, matrix.z_axis.z]
 }
 
 /// Since 1970 (Unix time), to microseconds.

@@ -24,13 +24,13 @@ mod stop;
 pub mod warning;
 mod watch;
 
-pub use config::{CameraConfig, Config, ConfigError, KnownModel};
+pub use config::{CameraConfig, Config, ConfigError, KnownModel, RigConfig};
 pub use engine::{CpuEngine, Engine, GpuEngine, GpuOptions, IN_FLIGHT, OpenDevice};
 pub use frame::Frame;
 pub use fusion::{Fused, Fusion};
 pub use input::{Calibration, Input};
-pub use lines::{Lines, Named};
-pub use observation::{Event, EventKind, Observation, Rates, Sink, SinkError, Statistics};
+pub use lines::{Lines, Named, NamedRig};
+pub use observation::{Event, EventKind, Observation, Rates, Sink, SinkError, Statistics, Word};
 pub use source::{Location, Shot, Source, SourceError, Stream};
 pub use stop::Stop;
 pub use watch::watch;

@@ -3,6 +3,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use image::RgbaImage;
 
+use super::Fused;
 use super::warning::{ActionReport, Warning};
 use crate::camera::Camera;
 use crate::cascade::Estimate;
@@ -101,6 +102,15 @@ pub struct Statistics {
     pub cameras: Vec<Rates>,
 }
 
+/// What a sink has to say to all others.
+#[derive(Debug, Clone)]
+pub enum Word {
+    /// Something happened.
+    Event(Event),
+    /// What the cameras of a rig see together.
+    Fused(Fused),
+}
+
 /// Why a sink gave up.
 pub type SinkError = Box<dyn std::error::Error + Send + Sync>;
 
@@ -120,6 +130,9 @@ pub trait Sink: Send {
 
     /// A second is over.
     fn statistics(&mut self, statistics: &Statistics);
+
+    /// The cameras of a rig were put together.
+    fn fused(&mut self, _: &Fused) {}
 
     /// Nothing more comes: what is waiting is brought to its end, within a second.
     ///

@@ -9,10 +9,10 @@ use super::message::Message;
 use super::pulse::Pulse;
 use super::reader::Reader;
 use super::scheduler::Scheduler;
-use super::{Event, EventKind, Input, Sink, SinkError, Statistics, Stop};
+use super::{Event, EventKind, Input, Sink, SinkError, Statistics, Stop, Word};
 
 /// Watches cameras until `stop` is set, or all sources came to their end and all their frames are answered. Then
-/// `sinks` finish; what kept any from it is returned. What arrives from `emitted`, where sinks send what they have to
+/// `sinks` finish; what kept any from it is returned. What arrives from `words`, where sinks send what they have to
 /// say, goes to all sinks.
 ///
 /// Threads that cannot be stopped in time (a driver that does not return) are left behind.
@@ -20,7 +20,7 @@ pub fn watch(
     inputs: Vec<Input>,
     engine: Box<dyn Engine>,
     sinks: Vec<Box<dyn Sink>>,
-    emitted: Receiver<Event>,
+    words: Receiver<Word>,
     stop: &Arc<Stop>,
 ) -> Vec<SinkError> {
     let mailboxes = Arc::new(Mailboxes::new(inputs.len()));
@@ -48,7 +48,7 @@ pub fn watch(
     drop(sender);
     let mut desk = Desk {
         sinks,
-        emitted,
+        words,
         pulses,
         mailboxes,
         ticked: Instant::now(),
@@ -62,7 +62,7 @@ pub fn watch(
 /// Where all that happens comes together, in order.
 struct Desk {
     sinks: Vec<Box<dyn Sink>>,
-    emitted: Receiver<Event>,
+    words: Receiver<Word>,
     pulses: Vec<Pulse>,
     mailboxes: Arc<Mailboxes>,
     /// When the last second was over.
@@ -189,8 +189,15 @@ impl Desk {
 
     /// Tells all sinks what one of them said.
     fn pass_on(&mut self) {
-        while let Ok(event) = self.emitted.try_recv() {
-            self.tell(&event);
+        while let Ok(word) = self.words.try_recv() {
+            match word {
+                Word::Event(event) => self.tell(&event),
+                Word::Fused(fused) => {
+                    for sink in &mut self.sinks {
+                        sink.fused(&fused);
+                    }
+                }
+            }
         }
     }
 

@@ -96,9 +96,29 @@ fn the_example_is_one() {
 }
 
 #[test]
+fn a_rig_is_cameras_that_see_the_same_robot() {
+    let folder = folder();
+    let camera = |name: &str| format!("[[camera]]\nname = \"{name}\"\nsource = \"photos\"\n");
+    let rig = "[[rig]]\nname = \"cell\"\ncameras = [\"c\", \"a\"]\nmemory_s = 2\n";
+    let text = ["a", "b", "c"].map(camera).concat() + rig;
+    let config = Config::parse(&text, &folder.path().join("cameras.toml"), &mut find).unwrap();
+    let [rig] = config.rigs.as_slice() else {
+        panic!("{:?}", config.rigs);
+    };
+    assert_eq!((rig.name.as_str(), rig.smoothing_s), ("cell", None));
+    assert_eq!(rig.cameras, [2, 0]);
+    assert_eq!(
+        (rig.options.memory_s, rig.options.simultaneous_s),
+        (2.0, 0.05)
+    );
+}
+
+#[test]
 fn what_is_wrong_is_told_with_file_line_and_key() {
     let folder = folder();
     let head = "[[camera]]\nname = \"a\"\nsource = \"photos\"\n";
+    let other = "[[camera]]\nname = \"b\"\nsource = \"photos\"\n";
+    let rig = "[[rig]]\ncameras = [\"a\", \"b\"]\n";
     // The fault's line, what is said, and the text.
     let cases = [
         (1, "camera: expected at least one", String::new()),
@@ -185,6 +205,40 @@ fn what_is_wrong_is_told_with_file_line_and_key() {
             4,
             "unknown variant `left`",
             format!("{head}orientation = \"left\"\n"),
+        ),
+        (
+            6,
+            "rig.cameras: expected two cameras",
+            format!("{head}[[rig]]\nname = \"r\"\ncameras = [\"a\"]\n"),
+        ),
+        (
+            6,
+            "rig.cameras: expected the name of a [[camera]]",
+            format!("{head}[[rig]]\nname = \"r\"\ncameras = [\"a\", \"z\"]\n"),
+        ),
+        (
+            6,
+            "rig.cameras: expected each camera once",
+            format!("{head}[[rig]]\nname = \"r\"\ncameras = [\"a\", \"a\"]\n"),
+        ),
+        (
+            9,
+            "rig.cameras: expected cameras of one robot",
+            format!(
+                "{head}{other}robot = \"ur10\"\n[[rig]]\nname = \"r\"\ncameras = [\"a\", \"b\"]\n"
+            ),
+        ),
+        (
+            9,
+            "rig.smoothing_s: expected 0 to 3600 seconds",
+            format!("{head}{other}{rig}smoothing_s = 0\nname = \"r\"\n"),
+        ),
+        (
+            6,
+            "warning.cameras: expected the name of a [[camera]]",
+            format!(
+                "{head}[[warning]]\nname = \"w\"\ncameras = [\"z\"]\nprotect = \"camera\"\nwarn_m = 1\nstop_m = 0.5\n"
+            ),
         ),
         (
             3,

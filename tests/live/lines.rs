@@ -5,8 +5,10 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
-use serde_json::Value;
-use whereabot::live::{Event, EventKind, Lines, Named, Sink, Statistics};
+use glam::{DAffine3, DMat3, DVec3};
+use serde_json::{Value, json};
+use whereabot::calibration::{CameraPose, FusedJoint};
+use whereabot::live::{Event, EventKind, Fused, Lines, Named, NamedRig, Sink, Statistics};
 
 /// A reader that reads when it is told to.
 struct Slow {
@@ -131,4 +133,49 @@ fn an_output_that_fails_is_told_of_once() {
     assert_eq!(kind, io::ErrorKind::BrokenPipe);
     // What comes later is of no interest to anybody.
     lines.event(&event());
+}
+
+#[test]
+fn what_a_rig_sees_names_its_cameras_and_joints() {
+    let (output, go, read) = slow();
+    let named = |camera: &str| Named {
+        camera: camera.into(),
+        robot: "cube".into(),
+    };
+    let rig = NamedRig {
+        rig: "cell".into(),
+        cameras: vec![1, 0, 2],
+        joints: vec!["elbow".into()],
+    };
+    let mut lines =
+        Lines::new(vec![named("a"), named("b"), named("c")], output, |_| {}).with_rigs(vec![rig]);
+    let pose = |x| CameraPose {
+        first_from_camera: DAffine3::from_translation(DVec3::new(x, 0.0, 0.0)),
+        covariance: [[0.0; 6]; 6],
+        inlier_share: 1.0,
+    };
+    let joint = FusedJoint {
+        xyz_m: DVec3::new(0.5, -0.25, 2.0),
+        covariance: DMat3::from_diagonal(DVec3::new(0.01, 0.04, 0.25)),
+        cameras: 2,
+    };
+    lines.fused(&Fused {
+        rig: 0,
+        time_s: 12.5,
+        joints: vec![joint],
+        // Nothing is known yet of the second of its cameras, which is `a`.
+        poses: vec![Some(pose(0.0)), None, Some(pose(1.5))],
+    });
+    drop(go);
+    drop(lines);
+    let line: Value = serde_json::from_slice(&read.lock().unwrap()).unwrap();
+    let still = [0.0, 0.0, 0.0, 1.0];
+    let expected = json!({
+        "schema": 1, "type": "fused", "rig": "cell", "acquired_s": 12.5, "frame": "camera_optical", "of": "b",
+        "joints": [{"name": "elbow", "xyz_m": [0.5, -0.25, 2.0], "sigma_m": [0.1, 0.2, 0.5], "cameras": 2}],
+        "cameras": [
+            {"camera": "b", "translation_m": [0.0, 0.0, 0.0], "rotation_xyzw": still},
+            {"camera": "c", "translation_m": [1.5, 0.0, 0.0], "rotation_xyzw": still}],
+    });
+    assert_eq!(line, expected);
 }

@@ -2,6 +2,7 @@
 
 mod camera;
 mod error;
+mod rig;
 
 use std::path::Path;
 
@@ -11,15 +12,19 @@ use toml::Spanned;
 pub use camera::CameraConfig;
 pub use error::ConfigError;
 pub(in crate::live) use error::Document;
+pub use rig::RigConfig;
 
 use super::warning;
 use camera::CameraTable;
+use rig::RigTable;
 
 /// A configuration file, checked whole.
 #[derive(Debug, Clone)]
 pub struct Config {
     /// The cameras, in the file's order.
     pub cameras: Vec<CameraConfig>,
+    /// Which of them see the same robot.
+    pub rigs: Vec<RigConfig>,
     /// When the robot is too close, and what is done then.
     pub warnings: warning::Config,
 }
@@ -31,6 +36,8 @@ pub struct Config {
 struct File {
     #[serde(default, rename = "camera")]
     cameras: Vec<Spanned<CameraTable>>,
+    #[serde(default, rename = "rig")]
+    rigs: Vec<RigTable>,
     #[serde(default, rename = "warning")]
     rules: Vec<warning::Rule>,
     #[serde(default, rename = "action")]
@@ -76,6 +83,7 @@ impl Config {
         let file: File = toml::from_str(text).map_err(|error| document.refused(&error))?;
         let File {
             cameras,
+            rigs,
             rules,
             actions,
         } = file;
@@ -88,6 +96,11 @@ impl Config {
             let camera = table.into_inner().check(&document, &checked, find_model)?;
             checked.push(camera);
         }
+        let mut checked_rigs = Vec::with_capacity(rigs.len());
+        for table in rigs {
+            let rig = table.check(&document, &checked_rigs, &checked)?;
+            checked_rigs.push(rig);
+        }
         let warnings = warning::Config { rules, actions };
         let observers: Vec<_> = checked.iter().map(CameraConfig::observer).collect();
         warnings.check(&observers).map_err(|error| {
@@ -96,6 +109,7 @@ impl Config {
         })?;
         Ok(Self {
             cameras: checked,
+            rigs: checked_rigs,
             warnings,
         })
     }
