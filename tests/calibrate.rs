@@ -274,7 +274,7 @@ fn frames_are_matched_by_file_name_and_by_order() {
 #[test]
 fn a_pose_is_told_in_the_forms_of_ros() {
     let bench = Bench::new();
-    bench.write("lines", &watched(&bench, "left", camera_from_base(0.3)));
+    bench.write("lines", &watched(&bench, "left cam", camera_from_base(0.3)));
     let header = format!("time_s,{}", JOINTS.join(","));
     bench.write("angles.csv", &table(&header, ","));
     let run = |form: &[&str]| {
@@ -294,7 +294,7 @@ fn a_pose_is_told_in_the_forms_of_ros() {
         "{text}"
     );
     assert!(
-        text.contains("--frame-id base_link --child-frame-id left_optical_frame"),
+        text.contains("--frame-id base_link --child-frame-id left_cam_optical_frame"),
         "{text}"
     );
     assert!(
@@ -305,10 +305,11 @@ fn a_pose_is_told_in_the_forms_of_ros() {
     let yaml: Value = serde_saphyr::from_str(&run(&["--yaml"])).unwrap();
     let transform = &yaml["transforms"][0];
     assert_eq!(transform["header"]["frame_id"], "base_link");
-    assert_eq!(transform["child_frame_id"], "left_optical_frame");
+    assert_eq!(transform["child_frame_id"], "left_cam_optical_frame");
     assert!((transform["transform"]["translation"]["y"].as_f64().unwrap() - y).abs() < 1e-6);
     let launch: Value = serde_saphyr::from_str(&run(&["--launch"])).unwrap();
     let node = &launch["launch"][0]["node"];
+    assert_eq!(node["name"], "left_cam_static_transform");
     assert_eq!(
         (&node["pkg"], &node["exec"]),
         (&json!("tf2_ros"), &json!("static_transform_publisher"))

@@ -184,7 +184,7 @@ fn calibrate(
         schema: 1,
         camera: camera.to_owned(),
         frame_id: robot.base_frame().to_owned(),
-        child_frame_id: format!("{camera}_optical_frame"),
+        child_frame_id: format!("{}_optical_frame", report::ros_name(camera)),
         translation_m: found.transform.translation.to_array(),
         rotation_xyzw: report::quaternion(&found),
         translation_sigma_m: found.translation_sigma_m(),

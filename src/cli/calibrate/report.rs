@@ -171,11 +171,16 @@ pub fn launch(reports: &[Report]) -> String {
             "# {}: {}\n- node:\n    pkg: tf2_ros\n    exec: static_transform_publisher\n    name: {}\n    args: {}\n",
             report.camera,
             report.sure(),
-            quoted(&format!("{}_static_transform", report.camera)),
+            quoted(&format!("{}_static_transform", ros_name(&report.camera))),
             quoted(&report.arguments()),
         );
     }
     text
+}
+
+/// What ROS takes in names of frames and nodes.
+pub fn ros_name(text: &str) -> String {
+    text.replace(|c: char| !c.is_ascii_alphanumeric(), "_")
 }
 
 /// A YAML string: JSON's are.
