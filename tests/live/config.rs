@@ -222,7 +222,7 @@ fn what_is_wrong_is_told_with_file_line_and_key() {
             format!("{head}[[rig]]\nname = \"r\"\ncameras = [\"a\", \"a\"]\n"),
         ),
         (
-            9,
+            10,
             "rig.cameras: expected cameras of one robot",
             format!(
                 "{head}{other}robot = \"ur10\"\n[[rig]]\nname = \"r\"\ncameras = [\"a\", \"b\"]\n"
