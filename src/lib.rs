@@ -19,7 +19,9 @@ pub mod recording;
 pub mod reference;
 pub mod verification;
 
-/// The library's example in the README is compiled with the tests.
+/// The examples in the documents are compiled with the tests.
 #[cfg(all(doctest, feature = "cli"))]
 #[doc = include_str!("../README.md")]
-struct Readme;
+#[doc = include_str!("../docs/calibration.md")]
+#[doc = include_str!("../docs/embedding.md")]
+struct Documents;

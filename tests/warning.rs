@@ -843,7 +843,7 @@ fn what_is_right_is_accepted() {
 /// The README's example is one that is accepted.
 #[test]
 fn the_readme_s_example_is_right() {
-    let readme = include_str!("../README.md");
+    let readme = include_str!("../docs/watch.md");
     let section = readme.split("\n## Warnings\n").nth(1).unwrap();
     let text = section.split("```toml").nth(1).unwrap();
     let text = text.split("```").next().unwrap();

@@ -35,7 +35,7 @@ use crate::network::{Description, Model};
 /// PATH. Exits with 0; with 1 if it could not start; with 2 on wrong usage.
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The cameras (see the README)
+    /// The cameras (see docs/watch.md)
     #[arg(value_name = "CAMERAS.TOML", required_unless_present = "source")]
     config: Option<PathBuf>,
     /// A camera without a file, may be given several times: a webcam's number, a stream's address, a video, a folder

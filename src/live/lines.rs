@@ -11,7 +11,7 @@ use super::warning::{ActionReport, Warning};
 use super::{Event, EventKind, Fused, Observation, Rates, Sink, Statistics};
 use crate::cascade::EstimateLine;
 
-/// JSON Lines: a result a camera a frame, events, and a line of statistics a second. `README.md` lists the keys.
+/// JSON Lines: a result a camera a frame, events, and a line of statistics a second. `docs/watch.md` lists the keys.
 ///
 /// A thread of its own writes them, each line with one write. Where whoever reads them is too slow, lines are lost,
 /// and the next line of statistics says how many.

@@ -114,6 +114,32 @@ fn a_rig_is_cameras_that_see_the_same_robot() {
 }
 
 #[test]
+fn the_readme_s_file_is_right() {
+    let folder = folder();
+    let info = std::fs::read(folder.path().join("info.yaml")).unwrap();
+    std::fs::write(folder.path().join("door.yaml"), info).unwrap();
+    let readme = include_str!("../../README.md");
+    let text = readme.split("```toml").nth(1).unwrap();
+    let text = text.split("```").next().unwrap();
+    // There is no webcam here.
+    let text = text.replace("source = 0 ", "source = \"http://x/0\" ");
+    let mut find = |_: Option<&str>, _: Option<&Path>| {
+        Ok(KnownModel {
+            place: 0,
+            uncertainty_m: Some(0.1),
+        })
+    };
+    let config = Config::parse(&text, &folder.path().join("cameras.toml"), &mut find).unwrap();
+    let counts = [
+        config.cameras.len(),
+        config.rigs.len(),
+        config.warnings.rules.len(),
+        config.warnings.actions.len(),
+    ];
+    assert_eq!(counts, [2, 1, 1, 1]);
+}
+
+#[test]
 fn what_is_wrong_is_told_with_file_line_and_key() {
     let folder = folder();
     let head = "[[camera]]\nname = \"a\"\nsource = \"photos\"\n";
