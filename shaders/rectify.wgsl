@@ -30,7 +30,9 @@ struct Rectification {
     origin: vec2<i32>,
 }
 
-@group(0) @binding(4) var<uniform> params: Rectification;
+// Not a uniform: where loops and branches depend on one, Mesa's lavapipe makes a shader of its values for every dispatch, and
+// keeps them all.
+@group(0) @binding(4) var<storage, read> params: Rectification;
 
 // Where a ray at z = 1 lands in the source, in pixels.
 fn project(ray: vec2<f32>) -> vec2<f32> {

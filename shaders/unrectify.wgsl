@@ -14,7 +14,8 @@ struct Unrectification {
 
 const STEP = 8u;
 
-@group(0) @binding(3) var<uniform> params: Unrectification;
+// Not a uniform, as in `rectify`.
+@group(0) @binding(3) var<storage, read> params: Unrectification;
 // [row][column], canonical pixels
 @group(0) @binding(4) var<storage, read> nodes: array<vec2<f32>>;
 // [row][column / 4], the first texel in the lowest byte

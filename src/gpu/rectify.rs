@@ -36,7 +36,7 @@ impl Rectify {
         let params = device.wgpu().create_buffer(&wgpu::BufferDescriptor {
             label: Some("rectify: params"),
             size: size_of::<Rectification>() as u64,
-            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+            usage: wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
         });
         Self {

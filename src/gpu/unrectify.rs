@@ -16,10 +16,10 @@ pub struct Unrectify {
     view: wgpu::TextureView,
 }
 
-/// What the kernel reads in its uniform.
+/// What the kernel reads besides the mask.
 #[derive(Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
-struct Uniform {
+struct Params {
     size: [u32; 2],
     columns: u32,
     stride: u32,
@@ -48,17 +48,17 @@ impl Unrectify {
         // Rows of a copy to a texture begin at multiples of so many bytes.
         let row = width.next_multiple_of(wgpu::COPY_BYTES_PER_ROW_ALIGNMENT);
         let bytes = storage_buffer(device, "mask: bytes", u64::from(row) * u64::from(height))?;
-        let buffer = |label, content: &[u8], usage| {
+        let buffer = |label, content: &[u8]| {
             let buffer = device.wgpu().create_buffer(&wgpu::BufferDescriptor {
                 label: Some(label),
                 size: content.len() as u64,
-                usage: usage | wgpu::BufferUsages::COPY_DST,
+                usage: wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST,
                 mapped_at_creation: false,
             });
             device.queue().write_buffer(&buffer, 0, content);
             buffer
         };
-        let uniform = Uniform {
+        let read = Params {
             size: params.size,
             columns: params.columns,
             stride: row / 4,
@@ -79,18 +79,9 @@ impl Unrectify {
                 bindings: &[
                     (
                         3,
-                        buffer(
-                            "unrectify: params",
-                            bytemuck::bytes_of(&uniform),
-                            wgpu::BufferUsages::UNIFORM,
-                        )
-                        .as_entire_binding(),
+                        buffer("unrectify: params", bytemuck::bytes_of(&read)).as_entire_binding(),
                     ),
-                    (
-                        4,
-                        buffer("unrectify: nodes", nodes, wgpu::BufferUsages::STORAGE)
-                            .as_entire_binding(),
-                    ),
+                    (4, buffer("unrectify: nodes", nodes).as_entire_binding()),
                     (5, bytes.as_entire_binding()),
                 ],
                 workgroups: (row as usize / 4 * height as usize).div_ceil(64),
