@@ -132,7 +132,9 @@ def test_committed_golden_files_are_what_pytorch_computes(tmp_path, request):
         made, kept = load_file(tmp_path / name), load_file(committed / name)
         assert made.keys() == kept.keys()
         for key in made:
-            assert torch.allclose(made[key].float(), kept[key].float(), atol=1e-6), (name, key)
+            # A convolution adds in another order on another CPU: what it rounds goes with its largest terms.
+            largest = max(1.0, float(kept[key].float().abs().max()))
+            assert torch.allclose(made[key].float(), kept[key].float(), atol=1e-6 * largest), (name, key)
     mask, joint, description = read_model(committed / "tiny.safetensors")
     mask.conv2.weight.data[0, 0, 1, 1] += 0.01
     values = golden.cascade_activations(
@@ -159,6 +161,7 @@ def test_joints_are_trained_on_beside_a_model_file_s_mask_network(train, recordi
     assert not all(torch.equal(tensor, other.state_dict()[key]) for key, tensor in joint.state_dict().items())
     for key in ("mask_training", "calibration"):
         assert again["card"][key] == description["card"][key]
+    assert again["presence"] == description["presence"]
 
 
 @pytest.mark.parametrize("layers", [paper_mask_layers(), context_mask_layers()])

@@ -70,9 +70,14 @@ def export_runs(args):
     def shares(numbers, threshold):
         return [float((estimated[n] >= 255 * threshold).mean()) for n in numbers]
 
-    sure, least = choose_presence(*(
-        {threshold: shares(chosen[kind[chosen]], threshold) for threshold in SURE_THRESHOLDS}
-        for kind in (seen, empty)))
+    if Path(args.mask).is_dir():
+        sure, least = choose_presence(*(
+            {threshold: shares(chosen[kind[chosen]], threshold) for threshold in SURE_THRESHOLDS}
+            for kind in (seen, empty)))
+    else:
+        # It is the mask network's, which stays.
+        presence = read_model(args.mask)[2]["presence"]
+        sure, least = presence["sure_threshold"], presence["min_sure"]
 
     shown = reported[seen[reported]]
     measured = evaluate.score_mask(mask, samples, reported, args.device)
