@@ -712,6 +712,25 @@ fn a_device_that_was_lost_before_is_an_error_and_the_host_s_handler_sees_nothing
 }
 
 #[test]
+fn a_host_that_submits_in_another_thread_hears_nothing_of_the_question_whether_it_lost_its_device()
+{
+    let host = Host::new();
+    host.device
+        .on_uncaptured_error(Arc::new(|error| panic!("the host's handler got {error}")));
+    let ours = host.ours();
+    std::thread::scope(|scope| {
+        let asking = scope.spawn(|| (0..20_000).for_each(|_| ours.check().unwrap()));
+        while !asking.is_finished() {
+            host.queue.submit([]);
+            host.device.poll(wgpu::PollType::Poll).unwrap();
+        }
+    });
+    // Nor does it take a device for sound that is not.
+    host.device.destroy();
+    assert!(matches!(ours.check(), Err(GpuError::Lost(_))));
+}
+
+#[test]
 fn a_locator_is_made_and_warmed_up_in_the_background() {
     let (host, model) = (Host::new(), model());
     let source = Source::new(host.rgba(&picture(1)), camera(WIDTH, HEIGHT));

@@ -1,8 +1,10 @@
 use std::sync::{Mutex, PoisonError, mpsc};
+use std::time::Duration;
 
 /// Tells whether a host's device is lost without its loss callback, of which there is one only: a device
 /// that is lost refuses to map a buffer at once.
 pub(super) struct Loss {
+    device: wgpu::Device,
     /// Never submitted, never mapped for long. One caller at a time may ask for it.
     buffer: Mutex<wgpu::Buffer>,
 }
@@ -10,6 +12,7 @@ pub(super) struct Loss {
 impl Loss {
     pub fn new(device: &wgpu::Device) -> Self {
         Self {
+            device: device.clone(),
             buffer: Mutex::new(device.create_buffer(&wgpu::BufferDescriptor {
                 label: Some("whereabot: is the device lost"),
                 size: 4,
@@ -30,10 +33,21 @@ impl Loss {
             // Nobody listens to what comes after this call.
             let _ = sender.send(result);
         });
-        let refused = matches!(receiver.try_recv(), Ok(Err(_)));
-        if !refused {
-            buffer.unmap();
+        if matches!(receiver.try_recv(), Ok(Err(_))) {
+            return true;
         }
-        refused
+        if !self.unmap(&buffer) {
+            // A submission of the host's, in another thread, is about to map it: that takes no time.
+            let _ = receiver.recv_timeout(Duration::from_secs(1));
+            self.unmap(&buffer);
+        }
+        false
+    }
+
+    /// Whether it could be unmapped. The host hears nothing of it if not.
+    fn unmap(&self, buffer: &wgpu::Buffer) -> bool {
+        let scope = self.device.push_error_scope(wgpu::ErrorFilter::Validation);
+        buffer.unmap();
+        pollster::block_on(scope.pop()).is_none()
     }
 }
