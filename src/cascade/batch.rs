@@ -217,27 +217,14 @@ impl BatchLocator {
             image,
             camera,
         } = *image;
-        let (width, height) = image.dimensions();
-        if (width, height) != (camera.width, camera.height) {
-            return Err(LocateError::Size {
-                expected_width: camera.width,
-                expected_height: camera.height,
-                width,
-                height,
-            });
-        }
         let places = self.cameras.len();
         let place = self.cameras.get_mut(place).ok_or(GpuError::Size {
             what: "camera",
             expected: places,
             found: place,
         })?;
-        let input = self.description.input;
-        let canonical = self.description.camera;
-        let view = match place.view {
-            Some(view) if view.is_of(camera, Texels::PLAIN) => view,
-            _ => View::new(camera, Texels::PLAIN, &canonical, input.width, input.height),
-        };
+        let size = image.dimensions().into();
+        let view = View::of(place.view, camera, size, Texels::PLAIN, &self.description)?;
         place.view = Some(view);
         self.plan.write_source(
             &self.device,

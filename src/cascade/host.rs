@@ -204,7 +204,8 @@ impl HostLocator {
     ///
     /// # Errors
     /// An index beyond the batch; a texture of another format, size or usage than what can be read; a camera
-    /// of another size than the image; a crop beyond it. The former source stays then.
+    /// of another size than the image; a crop beyond it: the former source stays then. Too little memory for
+    /// a mask texture of the new size: then the new source is searched, and the mask keeps its former size.
     pub fn set_source(&mut self, index: usize, source: &Source) -> Result<(), LocateError> {
         self.device.check()?;
         let [width, height] = source.planes.size();
@@ -220,28 +221,16 @@ impl HostLocator {
             });
         }
         let camera = &source.camera;
-        let [upright_width, upright_height] = crop.turned(source.orientation);
-        if [camera.width, camera.height] != [upright_width, upright_height] {
-            return Err(LocateError::Size {
-                expected_width: camera.width,
-                expected_height: camera.height,
-                width: upright_width,
-                height: upright_height,
-            });
-        }
-        let input = self.description.input;
-        let canonical = self.description.camera;
         let texels = Texels::new(crop, source.orientation);
         let last = self.views.get(index).copied().flatten();
-        let view = match last {
-            Some(view) if view.is_of(camera, texels) => view,
-            _ => View::new(camera, texels, &canonical, input.width, input.height),
-        };
+        let size = crop.turned(source.orientation);
+        let view = View::of(last, camera, size, texels, &self.description)?;
         self.plan
             .bind(&self.device, index, &source.planes, &view.rectification)?;
         if last != Some(view) {
             if self.mask == MaskSize::Source {
-                let params = Unrectification::new(camera, &canonical, crop, source.orientation);
+                let canonical = &self.description.camera;
+                let params = Unrectification::new(camera, canonical, crop, source.orientation);
                 self.outputs
                     .set_mask(&self.device, &self.plan, index, params)?;
             }

@@ -219,21 +219,8 @@ impl Locator {
 
     /// What the networks see of `image`, taken by `camera`.
     fn view(&mut self, image: &RgbaImage, camera: &Camera) -> Result<View, LocateError> {
-        let (width, height) = image.dimensions();
-        if (width, height) != (camera.width, camera.height) {
-            return Err(LocateError::Size {
-                expected_width: camera.width,
-                expected_height: camera.height,
-                width,
-                height,
-            });
-        }
-        let input = self.description.input;
-        let canonical = self.description.camera;
-        let view = match self.view.take() {
-            Some(view) if view.is_of(camera, Texels::PLAIN) => view,
-            _ => View::new(camera, Texels::PLAIN, &canonical, input.width, input.height),
-        };
+        let size = image.dimensions().into();
+        let view = View::of(self.view, camera, size, Texels::PLAIN, &self.description)?;
         self.view = Some(view);
         Ok(view)
     }

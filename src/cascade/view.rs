@@ -1,4 +1,6 @@
+use super::LocateError;
 use crate::camera::{Camera, Distortion, Intrinsics, Lens, Rectification, Texels};
+use crate::network::Description;
 
 /// What the networks see of a camera's image.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -18,7 +20,7 @@ pub(super) struct View {
 impl View {
     /// From `camera`, whose pixels lie at `texels`, to the pinhole `canonical` with images of
     /// `width` x `height`.
-    pub fn new(
+    fn new(
         camera: &Camera,
         texels: Texels,
         canonical: &Intrinsics,
@@ -44,9 +46,34 @@ impl View {
         }
     }
 
-    /// Whether this is the view of `camera`, whose pixels lie at `texels`.
-    pub fn is_of(&self, camera: &Camera, texels: Texels) -> bool {
-        self.camera == *camera && self.rectification.texels == texels
+    /// What the networks of `description` see of an upright image of `size` by `camera`, whose pixels lie at `texels`:
+    /// `last` where that is the same still.
+    pub fn of(
+        last: Option<Self>,
+        camera: &Camera,
+        [width, height]: [u32; 2],
+        texels: Texels,
+        description: &Description,
+    ) -> Result<Self, LocateError> {
+        if [width, height] != [camera.width, camera.height] {
+            return Err(LocateError::Size {
+                expected_width: camera.width,
+                expected_height: camera.height,
+                width,
+                height,
+            });
+        }
+        let is_same = |last: &Self| last.camera == *camera && last.rectification.texels == texels;
+        let input = description.input;
+        Ok(last.filter(is_same).unwrap_or_else(|| {
+            Self::new(
+                camera,
+                texels,
+                &description.camera,
+                input.width,
+                input.height,
+            )
+        }))
     }
 
     /// Where the camera sees what the canonical camera sees at `pixel`; `None` where its lens shows
