@@ -214,8 +214,21 @@ fn what_is_wrong_is_told_with_file_line_and_key() {
             "camera.hfov: expected degrees",
             format!("{head}hfov = 180\n"),
         ),
-        (4, "camera.fps: expected 0 to", format!("{head}fps = 0\n")),
-        (4, "camera.fps: expected 0 to", format!("{head}fps = nan\n")),
+        (
+            4,
+            "camera.fps: expected 0.001 to",
+            format!("{head}fps = 0\n"),
+        ),
+        (
+            4,
+            "camera.fps: expected 0.001 to",
+            format!("{head}fps = nan\n"),
+        ),
+        (
+            4,
+            "camera.fps: expected 0.001 to",
+            format!("{head}fps = 1e-30\n"),
+        ),
         (4, "fps: invalid type", format!("{head}fps = \"x\"\n")),
         (
             4,

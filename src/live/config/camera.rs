@@ -155,10 +155,10 @@ impl CameraTable {
         };
         let calibration = self.calibration(document, &location)?;
         if let Some(fps) = &self.fps
-            && !(*fps.get_ref() > 0.0 && *fps.get_ref() <= 1000.0)
+            && !(0.001..=1000.0).contains(fps.get_ref())
         {
             let message = format!(
-                "expected 0 to 1000 frames a second, found {}",
+                "expected 0.001 to 1000 frames a second, found {}",
                 fps.get_ref()
             );
             return fault("fps", fps.span(), message);
