@@ -43,14 +43,16 @@ def estimate_masks(network, samples, numbers, device, bf16=False):
 
 def mask_histograms(network, samples, numbers, device):
     """Pixels by logit: (robot, background), each [N, bins], for each of the samples."""
+    bins = len(LOGIT_EDGES) - 1
+    edges = torch.from_numpy(LOGIT_EDGES[1:-1]).to(device)
     histograms = []
     for batch in _batches(numbers):
         images, masks = samples.pixels(batch)
-        estimate = masks_of(network, images.to(device)).cpu().double().clamp(1e-6, 1 - 1e-6)
-        logits = torch.log(estimate / (1 - estimate)).clamp(LOGIT_EDGES[0], LOGIT_EDGES[-1] - 1e-9).numpy()
-        for logit, mask in zip(logits, masks.numpy() > 0.5, strict=True):
-            histograms.append([np.histogram(logit[mask], LOGIT_EDGES)[0], np.histogram(logit[~mask], LOGIT_EDGES)[0]])
-    robot, background = np.asarray(histograms).transpose(1, 0, 2)
+        logits = torch.logit(masks_of(network, images.to(device)).double(), eps=1e-6)
+        # A value on an edge is of the bin above.
+        counted = torch.bucketize(logits, edges, right=True) + bins * (masks.to(device) < 0.5)
+        histograms += [torch.bincount(each.flatten(), minlength=2 * bins).cpu().numpy() for each in counted]
+    robot, background = np.asarray(histograms).reshape(-1, 2, bins).transpose(1, 0, 2)
     return robot, background
 
 
@@ -92,6 +94,7 @@ def joint_errors(network, metres, samples, numbers, estimated, rule, device):
         images, masks = samples.pixels(batch)
         if estimated is not None:
             masks = torch.stack([torch.from_numpy(estimated[int(number)])[None].float() / 255 for number in batch])
+            masks = masks.to(images.device)
         outputs = network(overlay(images, masks, rule).to(device).contiguous(memory_format=torch.channels_last))
         truth = torch.from_numpy(samples.joints[batch])
         arms = torch.from_numpy(samples.arms[batch]).to(device)

@@ -159,13 +159,14 @@ def fit(args, network, numbers, draw, batch_loss, score, card):
             torch.nn.utils.clip_grad_norm_(network.parameters(), args.clip_gradient)
             optimizer.step()
             iteration += 1
-            total, counted = total + loss.item(), counted + 1
+            # Not read here: a GPU would have to be waited for.
+            total, counted = total + loss.detach(), counted + 1
             seconds = before + time.monotonic() - started
             progress = (iteration if args.iterations else seconds) / budget
             if iteration % args.evaluate_every == 0 or progress >= 1:
                 network.eval()
                 figures = {"iteration": iteration, "epoch": order.state["epoch"], "seconds": round(seconds, 1),
-                           "learning_rate": f"{rate:.3g}", "train_loss": round(total / counted, 5), **score()}
+                           "learning_rate": f"{rate:.3g}", "train_loss": round(float(total) / counted, 5), **score()}
                 total, counted = 0.0, 0
                 _append_csv(out / "log.csv", figures)
                 partial = last.with_suffix(".partial")
@@ -194,6 +195,8 @@ def _append_csv(path, row):
 def load_samples(args):
     """(training samples, their numbers, validation samples, their numbers, the card's account of both)."""
     samples = data.Samples(args.recording, args.cache)
+    if args.device != "cpu":
+        samples.keep(args.device)
     if args.validation:
         held_out, numbers = data.Samples(args.validation, args.cache), np.arange(len(samples))
         validation = np.arange(len(held_out))
@@ -302,7 +305,7 @@ def train_mask(args):
         if negatives is not None:
             rows = torch.rand(len(batch), device="cpu") < args.negative_share
             drawn = torch.randint(len(negatives), (int(rows.sum()),), device="cpu")
-            images[rows], masks[rows] = torch.from_numpy(negatives[drawn.numpy()]), 0.0
+            images[rows], masks[rows] = torch.from_numpy(negatives[drawn.numpy()]).to(images.device), 0.0
         images, masks = data.jitter_colours(images.to(args.device)), masks.to(args.device)
         if args.camera == "fixed":
             return data.random_crops(images, masks, height, width)
@@ -444,23 +447,19 @@ def train_joint(args):
         card |= {"init_from": Path(args.init_from).name}
     network = network.to(args.device, memory_format=torch.channels_last)
 
-    estimated = held_out_estimated = None
+    mask_network = held_out_estimated = None
     if args.mask_run:
-        mask_network = load_mask(args.mask_run)
-        mask_network.to(args.device, memory_format=torch.channels_last)
+        mask_network = load_mask(args.mask_run).to(args.device, memory_format=torch.channels_last)
         held_out_estimated = evaluate.estimate_masks(mask_network, held_out, validation, args.device)
-        if args.estimated_masks > 0:
-            estimated = evaluate.estimate_masks(mask_network, samples, numbers, args.device, bf16=True)
     elif args.estimated_masks > 0:
         raise SystemExit("--estimated-masks needs --mask-run")
 
     def draw(batch, progress):
         images, masks = samples.bytes(batch)
-        if estimated is not None and progress >= args.estimated_after:
-            for row in torch.nonzero(torch.rand(len(batch), device="cpu") < args.estimated_masks).flatten():
-                estimate = torch.from_numpy(estimated[int(batch[row])])[None, None].float() / 255
-                masks[row] = data.jitter_masks(estimate)[0]
         images, masks = data.jitter_colours(images.to(args.device)), masks.to(args.device)
+        rows = torch.rand(len(batch)) < (args.estimated_masks if progress >= args.estimated_after else 0)
+        if rows.any():
+            masks[rows] = data.jitter_masks(evaluate.masks_of(mask_network, images[rows], args.precision == "bf16"))
         overlays, truth = overlay(images, masks, rule), joints[batch].to(args.device)
         if args.camera == "free":
             overlays, truth = data.rotate_camera(
