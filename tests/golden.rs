@@ -11,7 +11,14 @@ use whereabot::gpu::{NetworkPlan, Precision};
 use whereabot::network::{Model, Network, Shape};
 use whereabot::reference;
 
-const NAMES: [&str; 5] = ["tiny", "threshold", "tiny_f16", "context", "heatmap"];
+const NAMES: [&str; 6] = [
+    "tiny",
+    "threshold",
+    "tiny_f16",
+    "context",
+    "heatmap",
+    "zoom",
+];
 
 fn file(name: &str) -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
@@ -109,10 +116,15 @@ fn the_overlay_agrees_with_pytorch() {
             ),
             model.mask_network.output(),
         );
-        let overlay = reference::overlay(&image, &mask, model.description.overlay);
+        let (overlay, gaze) = reference::joint_input(&image, &mask, &model.description);
         let expected = golden(name, "joint.overlay");
         assert!(difference(overlay.data(), &expected).unwrap() <= 1e-5);
         assert!(difference(image.data(), &expected).unwrap() > 1e-2);
+        let Some(gaze) = gaze else { continue };
+        let joints = golden(name, "joint.joints");
+        let expected = golden(name, "joints");
+        assert!(difference(&reference::zoom_joints(&joints, &gaze), &expected).unwrap() <= 1e-5);
+        assert!(difference(&joints, &expected).unwrap() > 1e-2);
     }
 }
 

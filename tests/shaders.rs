@@ -19,7 +19,7 @@ use Layout::{Buffer, HalfBuffer};
 
 /// What the library composes from the files in `shaders/`, and the constants that these want in their text:
 /// a file that nobody lists is not tested. Some have no layout: they bind their textures themselves, or draw.
-const KERNELS: [Kernel; 24] = [
+const KERNELS: [Kernel; 27] = [
     (&["back_project"], &Layout::ALL, &[]),
     (&["concat"], &Layout::ALL, &[]),
     (
@@ -72,6 +72,9 @@ const KERNELS: [Kernel; 24] = [
     (&["soft_argmax2d"], &Layout::ALL, &[]),
     (&["unrectify"], &Layout::ALL, &[]),
     (&["upsample2d"], &Layout::ALL, &[]),
+    (&["zoom_camera", "zoom"], &Layout::ALL, &[]),
+    (&["zoom_camera", "zoom_overlay"], &Layout::ALL, &[]),
+    (&["zoom_camera", "zoom_joints"], &Layout::ALL, &[]),
 ];
 
 type Kernel = (
@@ -256,7 +259,7 @@ fn compile(language: Language, entry: &EntryPoint, translated: &[u8]) -> Result<
 
 /// Kernels that naga clears arrays in, in HLSL by a cast of 0. Microsoft's compilers have that cast,
 /// glslang has not.
-const CLEARS_ARRAYS: [&str; 7] = [
+const CLEARS_ARRAYS: [&str; 8] = [
     "conv2d_buffer",
     "conv2d_subgroup",
     "conv2d_subgroup_one",
@@ -264,6 +267,7 @@ const CLEARS_ARRAYS: [&str; 7] = [
     "conv2d_tiled",
     "dense",
     "soft_argmax2d",
+    "zoom",
 ];
 
 /// What a compiler here says to a kernel that the backends' own compilers accept.

@@ -135,10 +135,15 @@ fn layer_times(
     let presence = model.description.presence;
     reference::coverage(&mask, presence.mask_threshold, presence.sure_threshold);
     lap();
-    let masked = reference::overlay(&image, &mask, model.description.overlay);
+    let (masked, gaze) = reference::joint_input(&image, &mask, &model.description);
     lap();
-    reference::run_each(&model.joint_network, &masked, |_| lap())
+    let joints = reference::run_each(&model.joint_network, &masked, |_| lap())
+        .and_then(|mut outputs| outputs.pop())
         .ok_or(LocateError::Shape("joint network"))?;
+    if let Some(gaze) = gaze {
+        reference::zoom_joints(joints.data(), &gaze);
+        lap();
+    }
     Ok(times)
 }
 
@@ -159,8 +164,16 @@ fn layer_works(model: &Model, batch: usize) -> Vec<LayerWork> {
     let mut layers = vec![between("rectify", pixels + image.len())];
     layers.extend(network_works("mask", &model.mask_network, batch));
     layers.push(between("coverage", mask.len()));
-    layers.push(between("overlay", 2 * image.len() + mask.len()));
+    let zooms = model.description.zoom.is_some();
+    let name = if zooms { "zoom_overlay" } else { "overlay" };
+    layers.push(between(name, 2 * image.len() + mask.len()));
     layers.extend(network_works("joint", &model.joint_network, batch));
+    if zooms {
+        layers.push(between(
+            "zoom_joints",
+            2 * model.joint_network.output().len(),
+        ));
+    }
     layers
 }
 

@@ -255,13 +255,16 @@ fn run_reference(
     })
 }
 
-fn reference_joints(
+pub(crate) fn reference_joints(
     model: &Model,
     image: &reference::Tensor,
     mask: &reference::Tensor,
 ) -> Result<Vec<f32>, LocateError> {
-    let masked = reference::overlay(image, mask, model.description.overlay);
+    let (masked, gaze) = reference::joint_input(image, mask, &model.description);
     let joints =
         reference::run(&model.joint_network, &masked).ok_or(LocateError::Shape("joint network"))?;
-    Ok(joints.data().to_vec())
+    Ok(match gaze {
+        Some(gaze) => reference::zoom_joints(joints.data(), &gaze),
+        None => joints.data().to_vec(),
+    })
 }

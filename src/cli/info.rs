@@ -58,6 +58,13 @@ fn card(model: &Model, file_size: usize) -> String {
             format!("colour where the mask is at least {threshold}")
         }
     };
+    let zoom = match description.zoom {
+        None => "none".to_owned(),
+        Some(zoom) => format!(
+            "{} standard deviations of the mask across the image, {} to {} times",
+            zoom.spread, zoom.least, zoom.most
+        ),
+    };
     let camera = description.camera;
     let mut text = format!(
         "robot       {}\n\
@@ -65,6 +72,7 @@ fn card(model: &Model, file_size: usize) -> String {
          joints      {}\n\
          input       {} x {} pixels, fx {} fy {} cx {} cy {}\n\
          overlay     {overlay}\n\
+         zoom        {zoom}\n\
          mask        probability of at least {}\n\
          presence    probability of at least {} on {} % of the input\n\
          size        {} MMAC an image, {parameters} parameters, {} KiB\n",

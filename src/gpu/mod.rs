@@ -32,6 +32,7 @@ mod tier;
 mod tuner;
 mod unrectify;
 mod upsample2d;
+mod zoom;
 
 #[cfg(not(target_arch = "wasm32"))]
 pub use adapter::list_adapters;
@@ -56,3 +57,4 @@ pub use step::{Step, Work};
 pub use tensor::Tensor;
 pub use tier::Tier;
 pub use unrectify::Unrectify;
+pub use zoom::Gazes;

@@ -15,18 +15,20 @@ pub fn overlay(
     output: &Tensor,
     rule: Overlay,
 ) -> Result<Step, GpuError> {
-    let (soft, threshold) = match rule {
-        Overlay::Multiply {} => (true, 0.0),
-        Overlay::Threshold { threshold } => (false, threshold),
-    };
     Step::by_texel(
         device,
         "overlay",
         ("overlay", include_str!("../../shaders/overlay.wgsl")),
-        &[
-            ("SOFT", f64::from(u8::from(soft))),
-            ("THRESHOLD", f64::from(threshold)),
-        ],
+        &rule_constants(rule),
         Tensors::both_to(image, mask, output),
     )
+}
+
+/// What the kernels that make an overlay know of its `rule`.
+pub(super) fn rule_constants(rule: Overlay) -> [(&'static str, f64); 2] {
+    let (soft, threshold) = match rule {
+        Overlay::Multiply {} => (1.0, 0.0),
+        Overlay::Threshold { threshold } => (0.0, f64::from(threshold)),
+    };
+    [("SOFT", soft), ("THRESHOLD", threshold)]
 }

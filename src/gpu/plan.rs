@@ -6,6 +6,7 @@ use super::rectify::Rectify;
 use super::source::Planes;
 use super::step::Step;
 use super::tensor::{Tensor, staging_buffer, storage_buffer};
+use super::zoom::Gazes;
 use super::{Device, GpuError, NetworkPlan, Precision};
 use crate::camera::Rectification;
 use crate::network::{Coverage, Model};
@@ -20,10 +21,19 @@ pub struct Plan {
     mask: NetworkPlan,
     coverage: Step,
     totals: wgpu::Buffer,
-    overlay: Step,
+    /// From the mask to the joint network's input.
+    overlay: Vec<Step>,
     joint: NetworkPlan,
+    zoomed: Option<Zoomed>,
     results: wgpu::Buffer,
     masks: wgpu::Buffer,
+}
+
+/// Behind a joint network that looks through a camera of its own: its joints in the canonical camera's frame.
+#[derive(Debug)]
+struct Zoomed {
+    step: Step,
+    joints: Tensor,
 }
 
 /// What the networks made of one image.
@@ -31,7 +41,7 @@ pub struct Plan {
 pub struct Frame {
     /// The mask's extent, in pixels of the network's image.
     pub coverage: Coverage,
-    /// The joint network's output: `x, y, z` a joint, in metres. Empty where only the mask was asked for.
+    /// `x, y, z` a joint, in metres, in the canonical camera's frame. Empty where only the mask was asked for.
     pub joints: Vec<f32>,
     /// The mask `[row][column]`, in [0, 1]. Empty unless asked for.
     pub mask: Vec<f32>,
@@ -98,7 +108,22 @@ impl Plan {
             let presence = description.presence;
             let thresholds = (presence.mask_threshold, presence.sure_threshold);
             let coverage = coverage(device, output, &totals, thresholds)?;
-            let overlay = overlay(device, &image, output, &masked, description.overlay)?;
+            let rule = description.overlay;
+            let (overlay, zoomed) = match description.zoom {
+                None => {
+                    let overlay = overlay(device, &image, output, &masked, rule)?;
+                    (vec![overlay], None)
+                }
+                Some(zoom) => {
+                    let gazes = Gazes::new(device, description.camera, batch)?;
+                    let seen = joint.output();
+                    let joints = Tensor::in_layout(device, layout, "joints", seen.shape, batch, 0)?;
+                    let zoom = gazes.zoom(device, output, zoom, presence.mask_threshold)?;
+                    let overlay = gazes.zoom_overlay(device, &image, output, &masked, rule)?;
+                    let step = gazes.zoom_joints(device, seen, &joints)?;
+                    (vec![zoom, overlay], Some(Zoomed { step, joints }))
+                }
+            };
             let results = staging_buffer(device, joint.output().staging_size() + totals.size());
             let masks = staging_buffer(device, output.staging_size());
             Ok(Self {
@@ -111,6 +136,7 @@ impl Plan {
                 masks,
                 mask,
                 joint,
+                zoomed,
             })
         })
     }
@@ -178,9 +204,12 @@ impl Plan {
         self.mask.output()
     }
 
-    /// The joint network's output: `[3 joints, 1, 1]`.
+    /// The joints in the canonical camera's frame: `[3 joints, 1, 1]`.
     pub(super) fn joints(&self) -> &Tensor {
-        self.joint.output()
+        match &self.zoomed {
+            Some(zoomed) => &zoomed.joints,
+            None => self.joint.output(),
+        }
     }
 
     /// What there is to see in the masks: one [`Totals`] an image.
@@ -188,15 +217,23 @@ impl Plan {
         &self.totals
     }
 
+    /// The dispatches from masks to joints.
+    fn joint_steps(&self) -> impl Iterator<Item = &Step> {
+        let back = self.zoomed.as_ref().map(|zoomed| &zoomed.step);
+        self.overlay.iter().chain(self.joint.steps()).chain(back)
+    }
+
     /// The dispatches of a frame, in order; those of the joint network only `with_joints`.
     pub fn steps(&self, with_joints: bool) -> impl Iterator<Item = &Step> {
-        let joints = [&self.overlay].into_iter().chain(self.joint.steps());
         self.rectify
             .iter()
             .filter_map(Rectify::step)
             .chain(self.mask.steps())
             .chain([&self.coverage])
-            .chain(joints.take(if with_joints { usize::MAX } else { 0 }))
+            .chain(
+                self.joint_steps()
+                    .take(if with_joints { usize::MAX } else { 0 }),
+            )
     }
 
     /// Runs a frame and waits for it: the result of each image of the batch. The masks are read back
@@ -264,13 +301,13 @@ impl Plan {
 
     /// A buffer for [`Self::copy_results`], to be mapped.
     pub(crate) fn results_buffer(&self, device: &Device) -> wgpu::Buffer {
-        let joints = self.joint.output().staging_size();
+        let joints = self.joints().staging_size();
         staging_buffer(device, joints + self.totals.size())
     }
 
     /// Records the copy of a frame's results, for [`Self::frames_in`].
     pub(crate) fn copy_results(&self, encoder: &mut wgpu::CommandEncoder, results: &wgpu::Buffer) {
-        let joints = self.joint.output();
+        let joints = self.joints();
         let (after_joints, totals) = (joints.staging_size(), self.totals.size());
         joints.copy_to(encoder, results, 0);
         encoder.copy_buffer_to_buffer(&self.totals, 0, results, after_joints, totals);
@@ -300,7 +337,7 @@ impl Plan {
     pub(crate) fn frames_in(&self, bytes: &[u8]) -> Vec<Frame> {
         let shape = self.image.shape;
         let (width, height) = (shape.width as u32, shape.height as u32);
-        let (joints, totals) = bytes.split_at(self.joint.output().staging_size() as usize);
+        let (joints, totals) = bytes.split_at(self.joints().staging_size() as usize);
         totals
             .chunks_exact(size_of::<Totals>())
             .zip(self.joints_in(joints))
@@ -352,10 +389,11 @@ impl Plan {
         for step in self.rectify.iter().filter_map(Rectify::step) {
             step.encode(&mut pass);
         }
-        self.overlay.encode(&mut pass);
-        self.joint.encode(&mut pass);
+        for step in self.joint_steps() {
+            step.encode(&mut pass);
+        }
         drop(pass);
-        let joints = self.joint.output();
+        let joints = self.joints();
         joints.copy_to(&mut encoder, &self.results, 0);
         device.queue().submit([encoder.finish()]);
         device.read(&self.results, |bytes| self.joints_in(bytes))
@@ -363,7 +401,7 @@ impl Plan {
 
     /// Each image's joints at the beginning of the results as they were copied.
     fn joints_in(&self, bytes: &[u8]) -> Vec<Vec<f32>> {
-        let output = self.joint.output();
+        let output = self.joints();
         let values = output.values(bytes);
         values
             .chunks_exact(output.shape.channels)

@@ -24,6 +24,9 @@ pub struct Description {
     pub mask_network: NetworkDescription,
     /// How mask and colour make the joint network's input.
     pub overlay: Overlay,
+    /// Where the joint network's camera looks; without it, it is the canonical camera.
+    #[serde(default)]
+    pub zoom: Option<Zoom>,
     /// From the overlay `[3, height, width]` to `x, y, z` of each joint, in metres, in the camera
     /// optical frame.
     pub joint_network: NetworkDescription,
@@ -63,6 +66,19 @@ pub enum Overlay {
         /// In (0, 1).
         threshold: f32,
     },
+}
+
+/// How the joint network's camera turns to the robot: to the mean of the mask's pixels, zoomed so that so many of their
+/// standard deviations are as wide or as high as the image, whichever is the less zoom.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Zoom {
+    /// Standard deviations across the image.
+    pub spread: f32,
+    /// Least zoom, as a multiple of the canonical camera's focal length.
+    pub least: f32,
+    /// Greatest zoom, likewise.
+    pub most: f32,
 }
 
 /// When a mask means that there is a robot.
@@ -135,6 +151,23 @@ impl Description {
         inside("presence.sure_threshold", self.presence.sure_threshold)?;
         if let Overlay::Threshold { threshold } = self.overlay {
             inside("overlay.threshold", threshold)?;
+        }
+        if let Some(zoom) = self.zoom {
+            let Zoom {
+                spread,
+                least,
+                most,
+            } = zoom;
+            if ![spread, least, most]
+                .iter()
+                .all(|v| (0.01..=100.0).contains(v))
+                || least > most
+            {
+                return Err(format!(
+                    "zoom: expected numbers between 0.01 and 100, least not above most, found spread {spread}, least \
+                     {least}, most {most}"
+                ));
+            }
         }
         if !(0.0..=1.0).contains(&self.presence.min_sure) {
             return Err(format!(

@@ -8,7 +8,7 @@ mod model;
 mod shape;
 
 pub use coverage::Coverage;
-pub use description::{Description, InputSize, NetworkDescription, Overlay, Presence};
+pub use description::{Description, InputSize, NetworkDescription, Overlay, Presence, Zoom};
 pub use graph::{Network, Node, Parameters, Source};
 pub use layer::{Activation, Layer, Operation};
 pub use model::{Model, ModelError};

@@ -16,6 +16,7 @@ mod sigmoid;
 mod soft_argmax2d;
 mod unrectify;
 mod upsample2d;
+mod zoom;
 
 pub use back_project::back_project;
 pub use concat::concat;
@@ -30,6 +31,7 @@ pub use sigmoid::sigmoid;
 pub use soft_argmax2d::soft_argmax2d;
 pub use unrectify::unrectify;
 pub use upsample2d::upsample2d;
+pub use zoom::{Gaze, joint_input, zoom, zoom_joints, zoom_overlay};
 
 use crate::network::{Activation, Shape};
 

@@ -3,6 +3,7 @@ use image::{Rgba, RgbaImage, imageops};
 use super::comparison::Comparison;
 use super::stages::numbers;
 use crate::camera::{Camera, Distortion, Intrinsics, Rectification};
+use crate::cascade::reference_joints;
 use crate::gpu::{Device, Frame, GpuError, Plan, Precision};
 use crate::network::Model;
 use crate::reference;
@@ -70,12 +71,9 @@ fn expected(model: &Model, image: &reference::Tensor, mask: &[f32]) -> Option<Fr
     let presence = description.presence;
     let expected = reference::run(&model.mask_network, image)?;
     let mask = reference::Tensor::new(expected.shape(), mask.to_vec())?;
-    let overlay = reference::overlay(image, &mask, description.overlay);
     Some(Frame {
         coverage: reference::coverage(&mask, presence.mask_threshold, presence.sure_threshold),
-        joints: reference::run(&model.joint_network, &overlay)?
-            .data()
-            .to_vec(),
+        joints: reference_joints(model, image, &mask).ok()?,
         mask: expected.data().to_vec(),
     })
 }

@@ -6,7 +6,7 @@ import torch
 from PIL import Image
 
 from whereabot_trainer import data
-from whereabot_trainer.networks import CAMERA, INPUT_HEIGHT, INPUT_WIDTH
+from whereabot_trainer.networks import INPUT_HEIGHT, INPUT_WIDTH
 
 
 def test_halve_is_the_mean_of_each_block():
@@ -57,34 +57,6 @@ def test_a_broken_line_is_named(recording, tmp_path, line, complaint):
     (folder / "samples.jsonl").write_text("".join([*lines[:2], line, *lines[3:]]))
     with pytest.raises(data.RecordingError, match=f"samples.jsonl: {complaint}"):
         data.Samples([folder], tmp_path / "cache")
-
-
-def _centroid(picture):
-    v, u = torch.meshgrid(torch.arange(INPUT_HEIGHT), torch.arange(INPUT_WIDTH), indexing="ij")
-    return torch.stack([(picture * u).sum(), (picture * v).sum()]) / picture.sum()
-
-
-def _project(points):
-    return torch.stack([CAMERA["fx"] * points[..., 0] / points[..., 2] + CAMERA["cx"],
-                        CAMERA["fy"] * points[..., 1] / points[..., 2] + CAMERA["cy"]], -1)
-
-
-def test_a_rotated_camera_sees_the_joints_where_the_image_shows_them():
-    torch.manual_seed(3)
-    joints = torch.tensor([[[0.2, -0.1, 1.5], [-0.3, 0.25, 1.8]]] * 4)
-    images = torch.zeros(4, 2, INPUT_HEIGHT, INPUT_WIDTH)
-    v, u = torch.meshgrid(torch.arange(INPUT_HEIGHT), torch.arange(INPUT_WIDTH), indexing="ij")
-    for channel, (x, y) in enumerate(_project(joints[0])):
-        images[:, channel] = torch.exp(-((u - x) ** 2 + (v - y) ** 2) / 18)
-    rotations = data.random_rotations(4)
-    warped, moved = data.rotate_camera(images, joints, rotations)
-    assert torch.allclose(moved.norm(dim=-1), joints.norm(dim=-1), atol=1e-6)
-    for sample in range(4):
-        for channel in range(2):
-            seen, expected = _centroid(warped[sample, channel]), _project(moved[sample, channel])
-            assert (seen - expected).norm() < 0.15, (seen, expected)
-            # The marker did move: an augmentation that does nothing must not pass.
-            assert (seen - _project(joints[sample, channel])).norm() > 0.5
 
 
 def test_views_keep_image_and_mask_together():

@@ -127,7 +127,7 @@ def test_committed_golden_files_are_what_pytorch_computes(tmp_path, request):
     committed = request.config.rootpath.parent / "tests" / "data" / "golden"
     golden.write_golden(tmp_path)
     names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == sorted(path.name for path in committed.iterdir()) and len(names) == 10
+    assert names == sorted(path.name for path in committed.iterdir()) and len(names) == 12
     for name in names:
         made, kept = load_file(tmp_path / name), load_file(committed / name)
         assert made.keys() == kept.keys()
@@ -138,7 +138,7 @@ def test_committed_golden_files_are_what_pytorch_computes(tmp_path, request):
     mask, joint, description = read_model(committed / "tiny.safetensors")
     mask.conv2.weight.data[0, 0, 1, 1] += 0.01
     values = golden.cascade_activations(
-        mask, joint, description["overlay"], load_file(committed / "tiny.activations.safetensors")["mask.image"])
+        mask, joint, description, load_file(committed / "tiny.activations.safetensors")["mask.image"])
     assert (values["joints"] - load_file(committed / "tiny.activations.safetensors")["joints"]).abs().max() > 1e-5
 
 

@@ -323,33 +323,6 @@ def random_crops(images, masks, height, width):
     return both[:, :3], both[:, 3:]
 
 
-def random_rotations(count, pan_tilt_degrees=8, roll_degrees=10):
-    """Small camera rotations [N, 3, 3]."""
-    tilt, pan = (torch.deg2rad(_uniform(count, -pan_tilt_degrees, pan_tilt_degrees)) for _ in range(2))
-    roll = torch.deg2rad(_uniform(count, -roll_degrees, roll_degrees))
-    skew = torch.zeros(count, 3, 3)
-    skew[:, 1, 2], skew[:, 0, 2], skew[:, 0, 1] = -tilt, pan, -roll
-    return torch.linalg.matrix_exp(skew - skew.mT)
-
-
-def rotate_camera(images, joints, rotations, camera=CAMERA):
-    """What the camera would see after a rotation, and the joints in its new frame.
-
-    Exact for a pinhole camera: pixels move by the homography K R K^-1, joints [N, 6, 3] by R. Zero comes in from beyond
-    the image.
-    """
-    count, _, height, width = images.shape
-    k = torch.tensor([[camera["fx"], 0, camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1]])
-    back = k @ rotations.mT @ torch.linalg.inv(k)
-    v, u = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
-    source = torch.stack([u, v, torch.ones_like(u)], -1).reshape(-1, 3) @ back.mT
-    source = source[..., :2] / source[..., 2:]
-    # Pixel centres are whole numbers here; grid_sample's -1 and 1 are the image's outer edges.
-    grid = (2 * source + 1) / torch.tensor([width, height]) - 1
-    warped = torch.nn.functional.grid_sample(images, grid.reshape(count, height, width, 2), align_corners=False)
-    return warped, joints @ rotations.mT
-
-
 def erase_rectangles(overlays, chance=0.5):
     """Zeroes one random rectangle in some of the overlays: what an occluder leaves of the mask."""
     count, _, height, width = overlays.shape

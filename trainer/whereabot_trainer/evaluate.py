@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from . import losses
-from .networks import JOINTS, overlay
+from . import losses, zoom
+from .networks import CAMERA, JOINTS, overlay
 
 BATCH = 8
 # Bins of the mask's logit, for IoU at every threshold at once.
@@ -86,25 +86,37 @@ def score_mask(network, samples, numbers, device, shift=0.0):
     return {name: round(float(curve[half]), 4) for name, curve in curves.items()}
 
 
+def overlays(images, masks, rule, view, camera=CAMERA):
+    """(the joint network's input, the cameras that see it) of images [N, 3, H, W] and masks [N, 1, H, W]: by the overlay's
+    rule and, unless it is None, the zoom's."""
+    if view is None:
+        return overlay(images, masks, rule), None
+    cameras = zoom.look_at(masks, view, camera)
+    seen = zoom.see(torch.cat([images, masks], 1), *cameras, camera)
+    return overlay(seen[:, :3], seen[:, 3:], rule), cameras
+
+
 @torch.no_grad()
-def joint_errors(network, metres, samples, numbers, estimated, rule, device):
-    """Distances [N, 6] in metres with the true masks, or with `estimated` ones, overlaid by the rule."""
+def joint_errors(network, metres, samples, numbers, estimated, rules, device):
+    """Distances [N, 6] in metres with the true masks, or with `estimated` ones; `rules` are the overlay's and the zoom's."""
     errors = []
     for batch in _batches(numbers):
         images, masks = samples.pixels(batch)
         if estimated is not None:
             masks = torch.stack([torch.from_numpy(estimated[int(number)])[None].float() / 255 for number in batch])
-            masks = masks.to(images.device)
-        outputs = network(overlay(images, masks, rule).to(device).contiguous(memory_format=torch.channels_last))
-        truth = torch.from_numpy(samples.joints[batch])
+        seen, cameras = overlays(images.to(device), masks.to(device), *rules)
         arms = torch.from_numpy(samples.arms[batch]).to(device)
-        errors.append(losses.joint_distances(metres(outputs, arms).cpu(), truth).numpy())
+        estimate = metres(network(seen.contiguous(memory_format=torch.channels_last)), arms)
+        if cameras is not None:
+            estimate = zoom.joints_of(estimate, *cameras)
+        truth = torch.from_numpy(samples.joints[batch])
+        errors.append(losses.joint_distances(estimate.cpu(), truth).numpy())
     return np.concatenate(errors)
 
 
-def score_joints(network, metres, samples, numbers, estimated, rule, device, name):
+def score_joints(network, metres, samples, numbers, estimated, rules, device, name):
     """Mean and median over samples of the error in centimetres, each sample's being the mean over its joints."""
-    each = 100 * joint_errors(network, metres, samples, numbers, estimated, rule, device).mean(1)
+    each = 100 * joint_errors(network, metres, samples, numbers, estimated, rules, device).mean(1)
     return {f"{name}_mean_cm": round(float(each.mean()), 2), f"{name}_median_cm": round(float(np.median(each)), 2)}
 
 

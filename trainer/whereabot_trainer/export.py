@@ -38,7 +38,7 @@ def export_runs(args):
     """Folds calibration and standardisation into the weights, measures the cascade, and writes the model file."""
     mask, mask_card = load_mask(args.mask), _mask_card(args.mask)
     joint, joint_state = load_network(args.joint)
-    rule = joint_state["card"]["overlay"]
+    rules = joint_state["card"]["overlay"], joint_state["card"]["zoom"]
 
     samples = data.Samples(args.validation or args.recording, args.cache)
     robots = sorted(set(samples.robots))
@@ -84,11 +84,11 @@ def export_runs(args):
     figures = {name: measured[name] for name in ("accuracy", "iou", "precision", "recall")}
     for name, masks in (("true_mask", None), ("estimated_mask", estimated)):
         figures |= evaluate.score_joints(
-            joint, evaluate.identity_metres, samples, shown, masks, rule, args.device, name)
+            joint, evaluate.identity_metres, samples, shown, masks, rules, args.device, name)
     found = shown[np.asarray(shares(shown, sure)) >= least]
     if len(found):
         figures |= evaluate.score_joints(
-            joint, evaluate.identity_metres, samples, found, estimated, rule, args.device, "found_estimated_mask")
+            joint, evaluate.identity_metres, samples, found, estimated, rules, args.device, "found_estimated_mask")
     figures["presence"] = {}
     for part, numbers in (("chosen", chosen), ("reported", reported)):
         figures["presence"] |= {
@@ -107,7 +107,7 @@ def export_runs(args):
         "licence": args.licence,
     }
     description = describe(
-        mask.layers, joint.layers, family=mask_card["mask_training"]["family"], robot=robot, overlay=rule,
+        mask.layers, joint.layers, family=mask_card["mask_training"]["family"], robot=robot, overlay=rules[0], zoom=rules[1],
         presence={"mask_threshold": 0.5, "sure_threshold": sure, "min_sure": least}, card=card)
     write_model(args.out, mask, joint, description, args.dtype)
     print(json.dumps({"chosen": description["presence"], "figures": figures}, indent=1))

@@ -2,7 +2,7 @@
 
 `NAME.safetensors` is a complete model file. `NAME.activations.safetensors` holds, in f32 and without a batch
 dimension, the input `mask.image`, every layer's output as `mask.{layer}` and `joint.{layer}`, the joint network's
-input `joint.overlay`, and the cascade's result `joints` [18].
+input `joint.overlay`, and the cascade's result `joints` [18], in the canonical camera's frame.
 """
 
 from pathlib import Path
@@ -10,8 +10,10 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_file
 
+from . import zoom
+from .evaluate import overlays
 from .model import describe, read_model, write_model
-from .networks import JOINT_INPUT, JOINTS, MASK_INPUT, Network, overlay
+from .networks import JOINT_INPUT, JOINTS, MASK_INPUT, Network
 
 WIDTH, HEIGHT = 20, 14
 CONTEXT_WIDTH, CONTEXT_HEIGHT = 24, 12
@@ -110,19 +112,23 @@ def _networks(seed, image, mask_layers, joint_layers):
 
 
 @torch.no_grad()
-def cascade_activations(mask, joint, rule, image):
+def cascade_activations(mask, joint, description, image):
     """Every value of the cascade on one image [3, H, W], by `{network}.{layer}`."""
     values = {f"mask.{name}": value[0] for name, value in mask.activations(image[None]).items()}
-    seen = overlay(image[None], values["mask.mask"][None], rule)
+    seen, cameras = overlays(image[None], values["mask.mask"][None], description["overlay"], description.get("zoom"),
+                             description["camera"])
     values |= {f"joint.{name}": value[0] for name, value in joint.activations(seen).items()}
     # A vector, not an image of one pixel.
     values = {name: value.flatten() if value.shape[1:] == (1, 1) else value for name, value in values.items()}
-    values["joints"] = values[f"joint.{joint.layers[-1]['name']}"].clone()
+    joints = values[f"joint.{joint.layers[-1]['name']}"].clone()
+    if cameras is not None:
+        joints = zoom.joints_of(joints.reshape(1, -1, 3), *cameras).flatten()
+    values["joints"] = joints
     return {name: value.contiguous() for name, value in values.items()}
 
 
 def write_golden(folder, seed=1):
-    """Writes the models `tiny`, `threshold`, `tiny_f16`, `context` and `heatmap` with their activations."""
+    """Writes the models `tiny`, `threshold`, `tiny_f16`, `context`, `heatmap` and `zoom` with their activations."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     torch.use_deterministic_algorithms(True)
@@ -131,21 +137,22 @@ def write_golden(folder, seed=1):
     paper = (MASK_LAYERS, JOINT_LAYERS, WIDTH, HEIGHT)
     context = (CONTEXT_LAYERS, JOINT_LAYERS, CONTEXT_WIDTH, CONTEXT_HEIGHT)
     heatmap = (MASK_LAYERS, HEATMAP_LAYERS, WIDTH, HEIGHT)
-    for name, family, (mask_layers, joint_layers, width, height), rule, dtype in (
-        ("tiny", "paper", paper, multiply, "f32"), ("threshold", "paper", paper, threshold, "f32"),
-        ("tiny_f16", "paper", paper, multiply, "f16"), ("context", "context", context, multiply, "f32"),
-        ("heatmap", "context", heatmap, multiply, "f32"),
+    # The mask is spread over the whole small image: this looks at the middle half of it.
+    view = {"spread": 2.0, "least": 0.5, "most": 4.0}
+    for name, family, (mask_layers, joint_layers, width, height), rule, view, dtype in (
+        ("tiny", "paper", paper, multiply, None, "f32"), ("threshold", "paper", paper, threshold, None, "f32"),
+        ("tiny_f16", "paper", paper, multiply, None, "f16"), ("context", "context", context, multiply, None, "f32"),
+        ("heatmap", "context", heatmap, multiply, None, "f32"), ("zoom", "context", heatmap, multiply, view, "f32"),
     ):
         image = torch.rand((3, height, width), generator=torch.Generator().manual_seed(seed))
         mask, joint = _networks(seed, image, mask_layers, joint_layers)
         description = describe(
-            mask_layers, joint_layers, family=family, robot="golden", overlay=rule, width=width, height=height,
+            mask_layers, joint_layers, family=family, robot="golden", overlay=rule, zoom=view, width=width, height=height,
             camera={"fx": 14.25, "fy": 14.25, "cx": (width - 1) / 2, "cy": (height - 1) / 2},
             presence={"mask_threshold": 0.5, "sure_threshold": 0.7, "min_sure": 0.01}, card=CARD)
         path = folder / f"{name}.safetensors"
         write_model(path, mask, joint, description, dtype)
-        stored_mask, stored_joint, _ = read_model(path)
-        values = cascade_activations(stored_mask, stored_joint, rule, image)
+        values = cascade_activations(*read_model(path), image)
         margin = (values["mask.mask"] - 0.5).abs().min().item()
         if margin < 1e-3:
             raise ValueError(f"a pixel of the mask is {margin:.1e} from the threshold: take another seed")

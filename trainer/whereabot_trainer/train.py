@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from . import data, evaluate, losses
+from . import data, evaluate, losses, zoom
 from .model import read_model
 from .networks import (
     JOINT_INPUT, JOINTS, MASK_INPUT, Network, context_mask_layers, heatmap_joint_layers, overlay, paper_joint_layers,
@@ -430,10 +430,11 @@ def train_joint(args):
     joints, arms = torch.from_numpy(samples.joints), torch.from_numpy(samples.arms)
     rule = {"rule": "threshold", "threshold": 0.5} if args.overlay == "threshold" else {"rule": "multiply"}
     if args.family == "context":
-        unit, layers = ArmLengths(), heatmap_joint_layers()
+        unit, layers, view = ArmLengths(), heatmap_joint_layers(), zoom.ZOOM
     else:
+        view = None
         unit, layers = Standardised.of(samples.joints[numbers]), paper_joint_layers(args.dilations, args.pool)
-    card |= {"family": args.family, "samples": len(numbers), "camera": args.camera, "overlay": rule, "min_coverage": args.min_coverage,
+    card |= {"family": args.family, "samples": len(numbers), "camera": args.camera, "overlay": rule, "zoom": view, "min_coverage": args.min_coverage,
              "estimated_masks": args.estimated_masks, "estimated_after": args.estimated_after, **unit.card()}
     network = initialise(Network(layers, JOINT_INPUT, normalise=args.normalise))
     if args.family == "context":
@@ -443,7 +444,7 @@ def train_joint(args):
         tensors, origin = starting_tensors(args.init_from, "joint")
         unit.unfold(tensors, origin)
         images, masks = samples.pixels(numbers[:: len(numbers) // 64 + 1])
-        start_from(network, tensors, overlay(images, masks, rule))
+        start_from(network, tensors, evaluate.overlays(images, masks, rule, view)[0])
         card |= {"init_from": Path(args.init_from).name}
     network = network.to(args.device, memory_format=torch.channels_last)
 
@@ -460,18 +461,26 @@ def train_joint(args):
         rows = torch.rand(len(batch)) < (args.estimated_masks if progress >= args.estimated_after else 0)
         if rows.any():
             masks[rows] = data.jitter_masks(evaluate.masks_of(mask_network, images[rows], args.precision == "bf16"))
-        overlays, truth = overlay(images, masks, rule), joints[batch].to(args.device)
+        truth, zooms = joints[batch].to(args.device), torch.ones(len(batch))
+        if view or args.camera == "free":
+            if view:
+                rotations, zooms = zoom.vary(*zoom.look_at(masks, view))
+            else:
+                rotations = zoom.turns(*(torch.deg2rad(torch.empty(len(batch)).uniform_(-most, most)) for most in (8, 8, 10)))
+            seen = zoom.see(torch.cat([images, masks], 1), rotations, zooms)
+            images, masks, truth = seen[:, :3], seen[:, 3:], zoom.joints_seen(truth, rotations, zooms)
+        overlays = overlay(images, masks, rule)
         if args.camera == "free":
-            overlays, truth = data.rotate_camera(
-                data.erase_rectangles(overlays), truth, data.random_rotations(len(batch)))
-        return overlays, (truth, arms[batch].to(args.device))
+            overlays = data.erase_rectangles(overlays)
+        return overlays, (truth, arms[batch].to(args.device), zooms)
 
     def batch_loss(overlays, joints_and_arms):
-        truth, size = joints_and_arms
+        truth, size, zooms = joints_and_arms
         values = network.activations(overlays)
-        # In arm lengths, so that a large robot does not count for more than a small one.
         estimate = unit.metres(values[network.layers[-1]["name"]], size)
-        loss = losses.joint_loss(estimate / size[:, None, None], truth / size[:, None, None])
+        # In arm lengths, so that a large robot does not count for more than a small one; what is seen is nearer than it is.
+        scale = torch.stack([torch.ones_like(zooms), torch.ones_like(zooms), zooms], 1)[:, None] / size[:, None, None]
+        loss = losses.joint_loss(estimate * scale, truth * scale)
         if args.family == "context":
             place = next(layer for layer in network.layers if layer["op"] == "soft_argmax2d")
             loss = loss + args.heat_weight * heat_loss(values["heat"], place, truth)
@@ -482,7 +491,7 @@ def train_joint(args):
         for name, masks in (("true_mask", None), ("estimated_mask", held_out_estimated)):
             if name == "true_mask" or masks is not None:
                 figures |= evaluate.score_joints(
-                    network, unit.metres, held_out, validation, masks, rule, args.device, name)
+                    network, unit.metres, held_out, validation, masks, (rule, view), args.device, name)
         return figures
 
     fit(args, network, numbers, draw, batch_loss, score, card)

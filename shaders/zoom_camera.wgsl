@@ -1,0 +1,19 @@
+// The camera that the joint network looks through, one an image of the batch: where the canonical camera is, turned to the
+// robot, zoomed in on it. Stands in front of the `zoom_*` kernels.
+struct Gaze {
+    // Rows of the rotation from the canonical camera's frame to this one's; beside the first, the zoom.
+    right: vec4<f32>,
+    down: vec4<f32>,
+    ahead: vec4<f32>,
+}
+
+// Of the canonical camera.
+override FX: f32;
+override FY: f32;
+override CX: f32;
+override CY: f32;
+
+// What lies in the direction `seen`, in the canonical camera's frame.
+fn turned_back(gaze: Gaze, seen: vec3<f32>) -> vec3<f32> {
+    return gaze.right.xyz * seen.x + gaze.down.xyz * seen.y + gaze.ahead.xyz * seen.z;
+}

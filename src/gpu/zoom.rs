@@ -1,0 +1,134 @@
+use super::overlay::rule_constants;
+use super::step::{Step, StepDescriptor, Tensors, Work};
+use super::tensor::{Tensor, storage_buffer};
+use super::{Device, GpuError};
+use crate::camera::Intrinsics;
+use crate::network::{Overlay, Zoom};
+
+/// Bytes of a camera, as `shaders/zoom_camera.wgsl` lays it out.
+const GAZE_SIZE: usize = 48;
+
+/// The joint network's cameras of a batch: turned to the robots and zoomed in on them, on the GPU.
+#[derive(Debug)]
+pub struct Gazes {
+    buffer: wgpu::Buffer,
+    canonical: Intrinsics,
+}
+
+impl Gazes {
+    /// For `batch` images of the `canonical` camera. Driver errors reach the caller's [`Device::scoped`].
+    ///
+    /// # Errors
+    /// More images than a buffer holds.
+    pub fn new(device: &Device, canonical: Intrinsics, batch: usize) -> Result<Self, GpuError> {
+        let buffer = storage_buffer(device, "zoom: cameras", (batch * GAZE_SIZE) as u64)?;
+        Ok(Self { buffer, canonical })
+    }
+
+    /// Turns them to what each `mask` `[1, height, width]` covers with at least `threshold`
+    /// (`shaders/zoom.wgsl`).
+    ///
+    /// # Errors
+    /// More images than a dispatch holds. Driver errors reach the caller's [`Device::scoped`].
+    pub fn zoom(
+        &self,
+        device: &Device,
+        mask: &Tensor,
+        zoom: Zoom,
+        threshold: f32,
+    ) -> Result<Step, GpuError> {
+        self.step(
+            device,
+            ("zoom", include_str!("../../shaders/zoom.wgsl")),
+            Tensors::from(mask),
+            &[
+                ("THRESHOLD", f64::from(threshold)),
+                ("SPREAD", f64::from(zoom.spread)),
+                ("LEAST", f64::from(zoom.least)),
+                ("MOST", f64::from(zoom.most)),
+            ],
+            mask.batch,
+        )
+    }
+
+    /// The joint network's input (`shaders/zoom_overlay.wgsl`): what they see of `image` `[3, height, width]`
+    /// masked by `mask` `[1, height, width]`.
+    ///
+    /// # Errors
+    /// More pixels than a dispatch holds. Driver errors reach the caller's [`Device::scoped`].
+    pub fn zoom_overlay(
+        &self,
+        device: &Device,
+        image: &Tensor,
+        mask: &Tensor,
+        output: &Tensor,
+        rule: Overlay,
+    ) -> Result<Step, GpuError> {
+        self.step(
+            device,
+            (
+                "zoom_overlay",
+                include_str!("../../shaders/zoom_overlay.wgsl"),
+            ),
+            Tensors::both_to(image, mask, output),
+            &rule_constants(rule),
+            output.texels().div_ceil(64),
+        )
+    }
+
+    /// The joints in the canonical camera's frame (`shaders/zoom_joints.wgsl`): from `seen` `[3 joints, 1, 1]`, as
+    /// the network sees them, to `output` of the same shape.
+    ///
+    /// # Errors
+    /// More joints than a dispatch holds. Driver errors reach the caller's [`Device::scoped`].
+    pub fn zoom_joints(
+        &self,
+        device: &Device,
+        seen: &Tensor,
+        output: &Tensor,
+    ) -> Result<Step, GpuError> {
+        self.step(
+            device,
+            (
+                "zoom_joints",
+                include_str!("../../shaders/zoom_joints.wgsl"),
+            ),
+            Tensors::from_to(seen, output),
+            &[("JOINTS", (seen.shape.channels / 3) as f64)],
+            output.texels().div_ceil(64),
+        )
+    }
+
+    fn step(
+        &self,
+        device: &Device,
+        (kernel, source): (&'static str, &str),
+        tensors: Tensors<'_>,
+        constants: &[(&str, f64)],
+        workgroups: usize,
+    ) -> Result<Step, GpuError> {
+        let camera = include_str!("../../shaders/zoom_camera.wgsl");
+        let Intrinsics { fx, fy, cx, cy } = self.canonical;
+        let mut all = vec![("FX", fx), ("FY", fy), ("CX", cx), ("CY", cy)];
+        all.extend(constants);
+        let work = Work::new(tensors, 0, 0);
+        Step::new(
+            device,
+            &StepDescriptor {
+                label: kernel,
+                kernel,
+                source: &format!("{camera}{source}"),
+                entry_point: "main",
+                tensors,
+                constants: &all,
+                sizes: &[],
+                bindings: &[(3, self.buffer.as_entire_binding())],
+                workgroups,
+                work: Work {
+                    bytes: work.bytes + self.buffer.size(),
+                    ..work
+                },
+            },
+        )
+    }
+}
