@@ -16,10 +16,18 @@ const ALL: Output = Output {
 };
 
 /// A random model that finds a robot in everything, so that there are joints to compare.
-fn model(seed: u64) -> Model {
+fn model(seed: u64, zoom: bool) -> Model {
     let mut description = description(256, 212, 32);
     description["presence"]["min_sure"] = 0.0.into();
+    if zoom {
+        description["zoom"] = zoomed();
+    }
     Model::from_bytes(&model_file(&description, seed), "random").unwrap()
+}
+
+/// A random mask covers half of everywhere: near enough to show something else than the image.
+fn zoomed() -> serde_json::Value {
+    serde_json::json!({"spread": 2.0, "least": 0.5, "most": 4.0})
 }
 
 /// Smooth colours with some noise, as a photo has.
@@ -46,8 +54,13 @@ fn mask(estimate: &Estimate) -> &[f32] {
 
 #[test]
 fn gpu_and_reference_agree() {
-    for (seed, width, height) in [(1, 512, 424), (2, 640, 480), (3, 300, 700)] {
-        let model = model(seed);
+    for (seed, width, height, zoom) in [
+        (1, 512, 424, false),
+        (2, 640, 480, false),
+        (3, 300, 700, false),
+        (3, 640, 480, true),
+    ] {
+        let model = model(seed, zoom);
         let image = picture(width, height, seed);
         let camera = Camera::from_hfov(width, height, 70_f64.to_radians());
         let gpu = Locator::on_gpu(device(), &model, Precision::F32)
@@ -66,7 +79,7 @@ fn gpu_and_reference_agree() {
 
 #[test]
 fn another_picture_is_noticed() {
-    let model = model(1);
+    let model = model(1, false);
     let camera = Camera::from_hfov(512, 424, 70_f64.to_radians());
     let mut locator = Locator::on_gpu(device(), &model, Precision::F32).unwrap();
     let first = locator.locate(&picture(512, 424, 1), &camera, ALL).unwrap();
@@ -79,11 +92,19 @@ fn another_picture_is_noticed() {
 
 #[test]
 fn a_batch_gives_what_single_images_give() {
-    let model = Model::from_bytes(&model_file(&description(48, 40, 5), 4), "random").unwrap();
+    let mut description = description(48, 40, 5);
+    for zoom in [serde_json::Value::Null, zoomed()] {
+        description["zoom"] = zoom;
+        let model = Model::from_bytes(&model_file(&description, 4), "random").unwrap();
+        gives_what_single_images_give(&model);
+    }
+}
+
+fn gives_what_single_images_give(model: &Model) {
     let device = device();
     let sizes = [(48, 40), (61, 33), (100, 90)];
     let frames = |batch: &[(u32, u32)]| -> Vec<Frame> {
-        let mut plan = Plan::new(&device, &model, batch.len(), Precision::F32).unwrap();
+        let mut plan = Plan::new(&device, model, batch.len(), Precision::F32).unwrap();
         for (index, &(width, height)) in batch.iter().enumerate() {
             let camera = Camera::from_hfov(width, height, 1.2);
             let image = picture(width, height, width.into());
@@ -237,4 +258,16 @@ fn a_mask_that_is_no_number_is_not_a_robot() {
     };
     let gpu = Locator::on_gpu(device(), &model, Precision::F32).unwrap();
     assert_eq!(status(gpu), expected);
+}
+
+#[test]
+fn a_zoomed_joint_network_sees_something_else() {
+    let image = picture(512, 424, 3);
+    let camera = Camera::from_hfov(512, 424, 70_f64.to_radians());
+    let [plain, zoomed] = [false, true].map(|zoom| {
+        let mut locator = Locator::on_gpu(device(), &model(3, zoom), Precision::F32).unwrap();
+        locator.locate(&image, &camera, ALL).unwrap()
+    });
+    assert_eq!(mask(&plain), mask(&zoomed));
+    assert!(difference(&joints(&plain), &joints(&zoomed)).unwrap() > 1e-3);
 }
