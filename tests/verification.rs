@@ -51,6 +51,7 @@ fn kernels() -> BTreeSet<String> {
         "probe_copy",
         "rectify",
         "render",
+        "zoom_camera",
     ];
     std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join("shaders"))
         .unwrap()

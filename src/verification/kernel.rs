@@ -5,6 +5,7 @@ use half::f16;
 use super::comparison::Comparison;
 use super::random::Random;
 use super::stages::{self, Source};
+use super::zoom;
 use crate::gpu::{Conv2dKernel, Device, GpuError, Layout, NetworkPlan};
 use crate::network::{Activation, Layer, Network, NetworkError, Operation, Parameters, Shape};
 use crate::reference;
@@ -22,6 +23,7 @@ pub(super) enum Kernel {
     BackProject,
     Rectify(Source),
     Overlay,
+    Zoom(zoom::Part),
     Coverage,
     Estimate,
     Unrectify,
@@ -66,6 +68,9 @@ impl Kernel {
             Self::Rectify(Source::Srgb),
             Self::Rectify(Source::Nv12),
             Self::Overlay,
+            Self::Zoom(zoom::Part::Camera),
+            Self::Zoom(zoom::Part::Overlay),
+            Self::Zoom(zoom::Part::Joints),
             Self::Coverage,
             Self::Estimate,
             Self::Unrectify,
@@ -109,6 +114,7 @@ impl Kernel {
         match self {
             Self::Rectify(source) => stages::rectify(device, layout, source, case).await,
             Self::Overlay => stages::overlay(device, layout, case).await,
+            Self::Zoom(part) => zoom::compare(device, layout, part, case).await,
             Self::Coverage => stages::coverage(device, layout, case).await,
             Self::Estimate => stages::estimate(device, layout, case).await,
             Self::Unrectify => stages::unrectify(device, layout, case).await,
@@ -233,6 +239,7 @@ impl Kernel {
             // They are between the networks, in no layer.
             Self::Rectify(_)
             | Self::Overlay
+            | Self::Zoom(_)
             | Self::Coverage
             | Self::Estimate
             | Self::Unrectify => return Err(NetworkError::Empty),
@@ -275,6 +282,9 @@ impl fmt::Display for Kernel {
             Self::Rectify(Source::Srgb) => "rectify_srgb",
             Self::Rectify(Source::Nv12) => "rectify_nv12",
             Self::Overlay => "overlay",
+            Self::Zoom(zoom::Part::Camera) => "zoom",
+            Self::Zoom(zoom::Part::Overlay) => "zoom_overlay",
+            Self::Zoom(zoom::Part::Joints) => "zoom_joints",
             Self::Coverage => "coverage",
             Self::Estimate => "estimate",
             Self::Unrectify => "unrectify",

@@ -8,6 +8,7 @@ mod kernel;
 mod random;
 mod report;
 mod stages;
+mod zoom;
 
 use crate::benchmark::{Adapter, Program, Weights};
 use crate::gpu::{Device, GpuError, Layout, Precision};

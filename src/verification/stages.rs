@@ -28,7 +28,7 @@ const FISHEYE: Distortion = Distortion::Equidistant {
 };
 
 /// Of a camera with images of `columns` x `rows` that sees 71 degrees from left to right.
-fn canonical(columns: usize, rows: usize) -> Intrinsics {
+pub(super) fn canonical(columns: usize, rows: usize) -> Intrinsics {
     Intrinsics {
         fx: 0.7 * columns as f64,
         fy: 0.7 * columns as f64,
