@@ -33,7 +33,7 @@ pub(super) fn dense(
         ("SEGMENTS", segments as f64),
         ("ACTIVATION", activation_number(activation).into()),
     ];
-    let partial = Step::new(
+    let partial = Step::trusted(
         device,
         &StepDescriptor {
             label,
@@ -55,7 +55,7 @@ pub(super) fn dense(
             ),
         },
     )?;
-    let finish = Step::new(
+    let finish = Step::trusted(
         device,
         &StepDescriptor {
             label,

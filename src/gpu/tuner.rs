@@ -62,7 +62,8 @@ impl Tuner {
         serde_json::to_vec_pretty(&memory).ok()
     }
 
-    /// The fastest of `candidates`; `None` where there is no choice, or no time left to find out.
+    /// The fastest of `candidates`, or of those for which the time sufficed, which is not remembered; `None` where
+    /// there is no choice, or no time at all.
     /// Overwrites what the layer reads and makes.
     pub fn choose(
         &self,
@@ -85,13 +86,23 @@ impl Tuner {
             return Ok(None);
         }
         let start = Instant::now();
-        let fastest = fastest(device, conv, candidates, start + state.left)?;
+        let found = fastest(device, conv, candidates, start + state.left)?;
         state.left = state.left.saturating_sub(start.elapsed());
-        if let Some(fastest) = fastest {
+        if let Found {
+            kernel: Some(fastest),
+            of_all: true,
+        } = found
+        {
             state.winners.insert(layer, fastest.to_string());
             state.changed = true;
         }
-        Ok(fastest)
+        Ok(found.kernel)
+    }
+
+    /// Whether `kernel` was found to answer rightly on the adapter: it was the fastest for some layer.
+    pub fn knows(&self, kernel: Conv2dKernel) -> bool {
+        let name = kernel.to_string();
+        self.state().winners.values().any(|winner| *winner == name)
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
@@ -106,6 +117,7 @@ fn identity(info: &wgpu::AdapterInfo) -> String {
         include_str!("../../shaders/conv2d_planes.wgsl"),
         include_str!("../../shaders/conv2d_buffer.wgsl"),
         include_str!("../../shaders/conv2d_tiled.wgsl"),
+        include_str!("../../shaders/conv2d_one.wgsl"),
         include_str!("../../shaders/conv2d_matrix.wgsl"),
         include_str!("../../shaders/conv2d_cooperative.wgsl"),
         include_str!("../../shaders/layout/buffer.wgsl"),
@@ -137,13 +149,20 @@ fn describe(conv: &Conv2d<'_>) -> String {
     )
 }
 
-/// `None` where `deadline` came before all were timed.
+/// The fastest of those that were timed.
+struct Found {
+    kernel: Option<Conv2dKernel>,
+    /// Not so where the time was over first.
+    of_all: bool,
+}
+
+/// Times `candidates` in their order, until `deadline`.
 fn fastest(
     device: &Device,
     conv: &Conv2d<'_>,
     candidates: &[Conv2dKernel],
     deadline: Instant,
-) -> Result<Option<Conv2dKernel>, GpuError> {
+) -> Result<Found, GpuError> {
     conv.input.fill(device);
     let plan = |kernel| device.scoped(|| by(kernel, device, conv));
     let expected = {
@@ -153,7 +172,12 @@ fn fastest(
     };
     let greatest = expected.iter().fold(0.0_f32, |most, v| most.max(v.abs()));
     let mut best = None;
+    let mut of_all = true;
     for &kernel in candidates {
+        if Instant::now() > deadline {
+            of_all = false;
+            break;
+        }
         let step = match plan(kernel) {
             Ok(step) => step,
             Err(error) => {
@@ -182,14 +206,15 @@ fn fastest(
         for _ in 0..3 {
             time = time.min(run(device, &step, repeats)? / repeats);
         }
-        if Instant::now() > deadline {
-            return Ok(None);
-        }
+        log::debug!("{}: {}, `{kernel}`: {time:?}", conv.label, describe(conv));
         if best.is_none_or(|(least, _)| time < least) {
             best = Some((time, kernel));
         }
     }
-    Ok(best.map(|(_, kernel)| kernel))
+    Ok(Found {
+        kernel: best.map(|(_, kernel)| kernel),
+        of_all,
+    })
 }
 
 /// How long so many runs take, submission included.
