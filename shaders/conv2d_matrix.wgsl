@@ -15,8 +15,8 @@ const VALUES_STRIDE = STEP + 2u;
 const TAPS_STRIDE = BLOCKS + 2u;
 const SUMS_STRIDE = 5u;
 const SUMS_TILE = 16u * SUMS_STRIDE;
-// What a stage brings, in fours.
-const VALUES = STEP * ROWS * SEGMENT;
+// What a stage brings, in pairs of blocks and in fours.
+const VALUES = STEP / 2u * ROWS * SEGMENT;
 const WEIGHTS = SPAN * STEP * 4u * BLOCKS;
 
 override STEPS: u32 = (IN_BLOCKS + STEP - 1u) / STEP;
@@ -41,20 +41,35 @@ var<private> image: u32;
 var<private> block_group: u32;
 var<private> corner: vec2<u32>;
 
-// Four channels of a pixel of a stage; `index` is [in block][row][column of the segment].
-fn value(stage: u32, index: u32) -> vec4<Half> {
-    let block = stage % STEPS * STEP + index / (ROWS * SEGMENT);
+// Eight channels of a pixel, from two blocks.
+struct Value {
+    low: vec4<Half>,
+    high: vec4<Half>,
+}
+
+// A pixel of a stage; `index` is [pair of in blocks][row][column of the segment].
+fn value(stage: u32, index: u32) -> Value {
+    let block = stage % STEPS * STEP + index / (ROWS * SEGMENT) * 2u;
     let tap = vec2(stage / STEPS % SPANS * SPAN, stage / (STEPS * SPANS));
     let pixel = corner + vec2(index % SEGMENT, index / SEGMENT % ROWS) + tap * DILATION;
     let at = vec2<i32>(pixel) - i32(KERNEL / 2u * DILATION);
-    if index >= VALUES || block >= IN_BLOCKS || !is_inside(at) {
-        return vec4<Half>();
+    var found = Value();
+    if index < VALUES && is_inside(at) {
+        if block < IN_BLOCKS {
+            found.low = seen(block * BATCH + image, vec2<u32>(at));
+        }
+        if block + 1u < IN_BLOCKS {
+            found.high = seen((block + 1u) * BATCH + image, vec2<u32>(at));
+        }
     }
-    let plane = block * BATCH + image;
+    return found;
+}
+
+fn seen(plane: u32, at: vec2<u32>) -> vec4<Half> {
     if INPUT_FULL {
-        return vec4<Half>(input_at(plane, u32(at.y), u32(at.x)));
+        return vec4<Half>(input_at(plane, at.y, at.x));
     }
-    return texel_at((plane * INPUT_HEIGHT + u32(at.y)) * INPUT_WIDTH + u32(at.x));
+    return texel_at((plane * INPUT_HEIGHT + at.y) * INPUT_WIDTH + at.x);
 }
 
 // Writes a tile of sums: of 16 pixels from `first` of the workgroup's on, in four blocks from `block` on.
@@ -94,7 +109,7 @@ fn main(
     let upper = subgroup / (SPLIT * WAYS) * 32u;
     let lower = upper + 16u;
 
-    var next_values: array<vec4<Half>, VALUES_EACH>;
+    var next_values: array<Value, VALUES_EACH>;
     var next_taps: array<vec4<Half>, WEIGHTS_EACH>;
     let first_weight = block_group * STAGES * WEIGHTS;
     for (var n = 0u; n < VALUES_EACH; n++) {
@@ -120,7 +135,9 @@ fn main(
         for (var n = 0u; n < VALUES_EACH; n++) {
             let i = n * GROUP + local;
             if i < VALUES {
-                values[i % (ROWS * SEGMENT) * VALUES_STRIDE + i / (ROWS * SEGMENT)] = next_values[n];
+                let to = i % (ROWS * SEGMENT) * VALUES_STRIDE + i / (ROWS * SEGMENT) * 2u;
+                values[to] = next_values[n].low;
+                values[to + 1u] = next_values[n].high;
             }
         }
         for (var n = 0u; n < WEIGHTS_EACH; n++) {

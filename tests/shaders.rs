@@ -39,7 +39,7 @@ const KERNELS: [Kernel; 25] = [
             ("WAYS", 2),
             ("SPAN", 1),
             ("SEGMENT", 32),
-            ("VALUES_EACH", 3),
+            ("VALUES_EACH", 1),
             ("WEIGHTS_EACH", 2),
         ],
     ),

@@ -23,8 +23,8 @@ pub(super) fn dense(
         .collect();
     let weights = constant_buffer(device, &format!("{label}: weight"), &weights)?;
     let bias = constant_buffer(device, &format!("{label}: bias"), &parameters.bias)?;
-    // Some thousand texels a workgroup: enough to hide its reduction, and enough workgroups.
-    let segments = length.div_ceil(2048);
+    // Some hundred texels a workgroup: enough to hide its reduction, and workgroups for a large GPU.
+    let segments = length.div_ceil(512);
     let sums = input.batch * outputs * segments;
     let partials = storage_buffer(device, &format!("{label}: partial sums"), 4 * sums as u64)?;
     let source = include_str!("../../shaders/dense.wgsl");

@@ -46,7 +46,7 @@ impl Device {
     pub const TIMEOUT: Duration = Duration::from_secs(60);
 
     /// What commands spend on [`Device::tuned`].
-    pub const TUNING: Duration = Duration::from_secs(2);
+    pub const TUNING: Duration = Duration::from_secs(5);
 
     /// What is asked for where the adapter has it.
     const FEATURES: wgpu::Features = wgpu::Features::SUBGROUP

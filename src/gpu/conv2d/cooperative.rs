@@ -88,10 +88,10 @@ impl Cut {
         self.rows * self.wide * self.ways * self.split
     }
 
-    /// Fours of values and of weights that a stage brings.
+    /// Pairs of blocks of values, and fours of weights, that a stage brings.
     fn stage(&self) -> [usize; 2] {
         [
-            self.step * self.rows * self.segment,
+            self.step / 2 * self.rows * self.segment,
             self.span * self.step * 4 * BLOCKS * self.ways,
         ]
     }
