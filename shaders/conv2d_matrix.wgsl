@@ -1,72 +1,96 @@
-// A convolution between buffers as a product of matrices in tiles of 16 x 16, behind `conv2d_planes` and
-// what multiplies tiles, in subgroups of 32. Factors are halves, sums f32.
+// A convolution between buffers of halves as a product of matrices in tiles of 16 x 16, behind
+// `conv2d_planes` and what multiplies tiles, in subgroups of 32. Factors are halves, sums f32.
 //
-// A workgroup of four subgroups makes TILE pixels of an image, as they come row after row, in 32 output
-// channels; a subgroup makes 32 of the pixels. Of each tap it brings STEP blocks of input channels and
-// their weights to workgroup memory.
+// A workgroup makes a tile of ROWS x WIDE pixels of an image in WAYS times 32 output channels. It goes by
+// stages: STEP blocks of input channels, one row of the kernel, SPAN of the row's taps. Of a stage it brings
+// the pixels that any of the taps sees, each once, and the weights to workgroup memory; meanwhile the next
+// stage's are on their way to registers. A subgroup makes 32 of the pixels in 32 channels, as four tiles of
+// sums, from a SPLITth of the stage's input channels.
 
-const TILE = 128u;
-// Output blocks of a workgroup.
-const BLOCKS = 8u;
-// Of rows in workgroup memory: a little apart, so that they do not begin in the same bank.
-const VALUES_STRIDE = 4u * STEP + 8u;
-const TAPS_STRIDE = 4u * BLOCKS + 8u;
-const SUMS_STRIDE = 4u * BLOCKS + 4u;
-// Not written out, as loops to a size are.
-const DEPTH = STEP / 4u;
+const GROUP = ROWS * WIDE * WAYS * SPLIT;
+// Blocks of output channels.
+const BLOCKS = 8u * WAYS;
+// Rows in workgroup memory are a little longer than full, so that they do not begin in the same bank.
+const VALUES_STRIDE = STEP + 2u;
+const TAPS_STRIDE = BLOCKS + 2u;
+const SUMS_STRIDE = 5u;
+const SUMS_TILE = 16u * SUMS_STRIDE;
+// What a stage brings, in pairs of blocks and in fours.
+const VALUES = STEP / 2u * ROWS * SEGMENT;
+const WEIGHTS = SPAN * STEP * 4u * BLOCKS;
 
 override STEPS: u32 = (IN_BLOCKS + STEP - 1u) / STEP;
-override TILES: u32 = (HEIGHT * WIDTH + TILE - 1u) / TILE;
+override SPANS: u32 = KERNEL / SPAN;
+override STAGES: u32 = KERNEL * SPANS * STEPS;
+override TILES_ACROSS: u32 = (WIDTH + WIDE - 1u) / WIDE;
+override TILES: u32 = TILES_ACROSS * ((HEIGHT + ROWS - 1u) / ROWS);
 override BLOCK_GROUPS: u32 = (OUT_BLOCKS + BLOCKS - 1u) / BLOCKS;
 
-// [kernel row][kernel column][in block, to full steps][out block, to full groups][in channel] of four
-// outputs
-@group(0) @binding(3) var<storage, read> weights: array<vec4<f32>>;
+// [row][column of the segment][in channel]
+var<workgroup> values: array<vec4<Half>, ROWS * SEGMENT * VALUES_STRIDE>;
+// [tap][in channel][out channel]
+var<workgroup> taps: array<vec4<Half>, SPAN * STEP * 4u * TAPS_STRIDE>;
+// [subgroup][pixel][out channel]
+var<workgroup> sums: array<vec4<f32>, GROUP / 32u * SUMS_TILE>;
 
-// [pixel][in channel]
-var<workgroup> values: array<Half, TILE * VALUES_STRIDE>;
-// [in channel][out channel]
-var<workgroup> taps: array<Half, 4u * STEP * TAPS_STRIDE>;
-// [pixel][out channel]
-var<workgroup> sums: array<f32, TILE * SUMS_STRIDE>;
-
-// Of the invocation: its index, and the pixel that it brings and stores.
 var<private> local: u32;
-var<private> pixel: u32;
+// Which SPLITth of the input channels the subgroup has.
+var<private> part: u32;
+// Of the workgroup.
+var<private> image: u32;
+var<private> block_group: u32;
+var<private> corner: vec2<u32>;
 
-// What a tap sees of STEP blocks of channels from `first` on.
-fn bring_values(image: u32, first: u32, tap: u32) {
-    let at = seen_from(pixel, tap);
-    let inside = is_inside(at);
-    for (var n = 0u; n < STEP; n++) {
-        var value = vec4(0.0);
-        if inside && first + n < IN_BLOCKS {
-            value = input_at((first + n) * BATCH + image, u32(at.y), u32(at.x));
+// Eight channels of a pixel, from two blocks.
+struct Value {
+    low: vec4<Half>,
+    high: vec4<Half>,
+}
+
+// A pixel of a stage; `index` is [pair of in blocks][row][column of the segment].
+fn value(stage: u32, index: u32) -> Value {
+    let block = stage % STEPS * STEP + index / (ROWS * SEGMENT) * 2u;
+    let tap = vec2(stage / STEPS % SPANS * SPAN, stage / (STEPS * SPANS));
+    let pixel = corner + vec2(index % SEGMENT, index / SEGMENT % ROWS) + tap * DILATION;
+    let at = vec2<i32>(pixel) - i32(KERNEL / 2u * DILATION);
+    var found = Value();
+    if index < VALUES && is_inside(at) {
+        if block < IN_BLOCKS {
+            found.low = seen(block * BATCH + image, vec2<u32>(at));
         }
-        let to = local * VALUES_STRIDE + 4u * n;
-        values[to] = Half(value.x);
-        values[to + 1u] = Half(value.y);
-        values[to + 2u] = Half(value.z);
-        values[to + 3u] = Half(value.w);
+        if block + 1u < IN_BLOCKS {
+            found.high = seen((block + 1u) * BATCH + image, vec2<u32>(at));
+        }
+    }
+    return found;
+}
+
+fn seen(plane: u32, at: vec2<u32>) -> vec4<Half> {
+    if INPUT_FULL {
+        return vec4<Half>(input_at(plane, at.y, at.x));
+    }
+    return texel_at((plane * INPUT_HEIGHT + at.y) * INPUT_WIDTH + at.x);
+}
+
+// Writes a tile of sums: of 16 pixels from `first` of the workgroup's on, in four blocks from `block` on.
+// The subgroups that have parts of it share the work.
+fn finish(first: u32, block: u32) {
+    let subgroup = local / 32u - part;
+    for (var texel = part * 32u + local % 32u; texel < 64u; texel += 32u * SPLIT) {
+        let out_block = block_group * BLOCKS + block + texel / 16u;
+        var sum = bias[out_block];
+        for (var other = 0u; other < SPLIT; other++) {
+            sum += sums[(subgroup + other) * SUMS_TILE + texel % 16u * SUMS_STRIDE + texel / 16u];
+        }
+        let pixel = first + texel % 16u;
+        let at = corner + vec2(pixel % WIDE, pixel / WIDE);
+        if all(at < vec2(WIDTH, HEIGHT)) && out_block < OUT_BLOCKS {
+            output_set(out_block * BATCH + image, at.y, at.x, activate(sum));
+        }
     }
 }
 
-// The weights of STEP blocks of input channels for the workgroup's output channels: from `first` on, in
-// blocks of both.
-fn bring_taps(first: u32) {
-    for (var i = local; i < STEP * BLOCKS * 4u; i += TILE) {
-        let in_block = i / (BLOCKS * 4u);
-        let out_block = i / 4u % BLOCKS;
-        let weight = weights[(first + in_block * BLOCK_GROUPS * BLOCKS + out_block) * 4u + i % 4u];
-        let to = (4u * in_block + i % 4u) * TAPS_STRIDE + 4u * out_block;
-        taps[to] = Half(weight.x);
-        taps[to + 1u] = Half(weight.y);
-        taps[to + 2u] = Half(weight.z);
-        taps[to + 3u] = Half(weight.w);
-    }
-}
-
-@compute @workgroup_size(TILE)
+@compute @workgroup_size(GROUP)
 fn main(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
@@ -74,37 +98,73 @@ fn main(
 ) {
     local = index;
     let workgroup = group.y * groups.x + group.x;
-    let first_block = workgroup % BLOCK_GROUPS * BLOCKS;
-    pixel = workgroup / BLOCK_GROUPS % TILES * TILE + local;
-    let image = workgroup / (BLOCK_GROUPS * TILES) % BATCH;
+    block_group = workgroup % BLOCK_GROUPS;
+    let tile = workgroup / BLOCK_GROUPS % TILES;
+    corner = vec2(tile % TILES_ACROSS * WIDE, tile / TILES_ACROSS * ROWS);
+    image = workgroup / (BLOCK_GROUPS * TILES) % BATCH;
 
-    for (var block = 0u; block < 8u; block++) {
-        let start = bias[first_block + block];
-        let to = local * SUMS_STRIDE + 4u * block;
-        sums[to] = start.x;
-        sums[to + 1u] = start.y;
-        sums[to + 2u] = start.z;
-        sums[to + 3u] = start.w;
+    let subgroup = local / 32u;
+    part = subgroup % SPLIT;
+    let way = subgroup / SPLIT % WAYS;
+    let upper = subgroup / (SPLIT * WAYS) * 32u;
+    let lower = upper + 16u;
+
+    var next_values: array<Value, VALUES_EACH>;
+    var next_taps: array<vec4<Half>, WEIGHTS_EACH>;
+    let first_weight = block_group * STAGES * WEIGHTS;
+    for (var n = 0u; n < VALUES_EACH; n++) {
+        next_values[n] = value(0u, n * GROUP + local);
+    }
+    for (var n = 0u; n < WEIGHTS_EACH; n++) {
+        next_taps[n] = weight_at(first_weight + min(n * GROUP + local, WEIGHTS - 1u));
+    }
+
+    for (var i = local; i < SUMS_TILE; i += GROUP) {
+        sums[i] = vec4(0.0);
     }
     workgroupBarrier();
-    let upper = local / 32u * 32u;
-    let lower = upper + 16u;
-    var upper_left = sums_at(upper * SUMS_STRIDE);
-    var upper_right = sums_at(upper * SUMS_STRIDE + 16u);
-    var lower_left = sums_at(lower * SUMS_STRIDE);
-    var lower_right = sums_at(lower * SUMS_STRIDE + 16u);
+    var upper_left = sums_at(0u);
+    var upper_right = sums_at(0u);
+    var lower_left = sums_at(0u);
+    var lower_right = sums_at(0u);
 
-    for (var tap = 0u; tap < KERNEL * KERNEL; tap++) {
-        for (var step = 0u; step < STEPS; step++) {
-            workgroupBarrier();
-            bring_values(image, step * STEP, tap);
-            bring_taps((tap * STEPS + step) * STEP * BLOCK_GROUPS * BLOCKS + first_block);
-            workgroupBarrier();
-            for (var k = 0u; k < DEPTH; k++) {
-                let above = values_at(upper * VALUES_STRIDE + 16u * k);
-                let below = values_at(lower * VALUES_STRIDE + 16u * k);
-                let left = taps_at(16u * k * TAPS_STRIDE);
-                let right = taps_at(16u * k * TAPS_STRIDE + 16u);
+    let first_above = (upper / WIDE * SEGMENT + upper % WIDE) * VALUES_STRIDE;
+    let first_below = (lower / WIDE * SEGMENT + lower % WIDE) * VALUES_STRIDE;
+    for (var stage = 0u; stage < STAGES; stage++) {
+        workgroupBarrier();
+        for (var n = 0u; n < VALUES_EACH; n++) {
+            let i = n * GROUP + local;
+            if i < VALUES {
+                let to = i % (ROWS * SEGMENT) * VALUES_STRIDE + i / (ROWS * SEGMENT) * 2u;
+                values[to] = next_values[n].low;
+                values[to + 1u] = next_values[n].high;
+            }
+        }
+        for (var n = 0u; n < WEIGHTS_EACH; n++) {
+            let i = n * GROUP + local;
+            if i < WEIGHTS {
+                taps[i / BLOCKS * TAPS_STRIDE + i % BLOCKS] = next_taps[n];
+            }
+        }
+        workgroupBarrier();
+        if stage + 1u < STAGES {
+            for (var n = 0u; n < VALUES_EACH; n++) {
+                next_values[n] = value(stage + 1u, n * GROUP + local);
+            }
+            let first = first_weight + (stage + 1u) * WEIGHTS;
+            for (var n = 0u; n < WEIGHTS_EACH; n++) {
+                next_taps[n] = weight_at(first + min(n * GROUP + local, WEIGHTS - 1u));
+            }
+        }
+        for (var tap = 0u; tap < SPAN; tap++) {
+            for (var k = 0u; k < SHARE; k++) {
+                let depth = part * SHARE + k;
+                let seen = tap * DILATION * VALUES_STRIDE + 4u * depth;
+                let weight = (tap * STEP * 4u + 16u * depth) * TAPS_STRIDE + 8u * way;
+                let above = values_at(first_above + seen);
+                let below = values_at(first_below + seen);
+                let left = taps_at(weight);
+                let right = taps_at(weight + 4u);
                 upper_left = multiply_add(above, left, upper_left);
                 upper_right = multiply_add(above, right, upper_right);
                 lower_left = multiply_add(below, left, lower_left);
@@ -113,19 +173,20 @@ fn main(
         }
     }
 
-    keep(upper_left, upper * SUMS_STRIDE);
-    keep(upper_right, upper * SUMS_STRIDE + 16u);
-    keep(lower_left, lower * SUMS_STRIDE);
-    keep(lower_right, lower * SUMS_STRIDE + 16u);
+    let own = subgroup * SUMS_TILE;
+    keep(upper_left, own);
     workgroupBarrier();
-    if pixel < HEIGHT * WIDTH {
-        for (var block = 0u; block < 8u; block++) {
-            let from_sum = local * SUMS_STRIDE + 4u * block;
-            let sum = vec4(sums[from_sum], sums[from_sum + 1u], sums[from_sum + 2u], sums[from_sum + 3u]);
-            if first_block + block < OUT_BLOCKS {
-                let plane = (first_block + block) * BATCH + image;
-                output_set(plane, pixel / WIDTH, pixel % WIDTH, activate(sum));
-            }
-        }
-    }
+    finish(upper, 8u * way);
+    workgroupBarrier();
+    keep(upper_right, own);
+    workgroupBarrier();
+    finish(upper, 8u * way + 4u);
+    workgroupBarrier();
+    keep(lower_left, own);
+    workgroupBarrier();
+    finish(lower, 8u * way);
+    workgroupBarrier();
+    keep(lower_right, own);
+    workgroupBarrier();
+    finish(lower, 8u * way + 4u);
 }

@@ -2,8 +2,8 @@
 // `conv2d_planes`: for GPUs.
 //
 // A workgroup makes TILE pixels of an image, as they come row after row, in BLOCKS blocks of four output
-// channels. Of each tap it brings STEP blocks of input channels and their weights to workgroup memory,
-// where its invocations share them: each makes PIXELS pixels, LANES apart, in a pair of blocks, and
+// channels. It goes by stages: of each tap it brings STEP blocks of input channels and their weights to workgroup
+// memory, while the next stage's are on their way to registers. Its invocations share them: each makes PIXELS pixels, LANES apart, in a pair of blocks, and
 // reads from there two texels for sixteen multiply-adds each.
 
 const GROUP = 64u;
@@ -13,7 +13,12 @@ const BLOCKS = 2u * PAIRS;
 // Not written out, as loops to a size are: long enough as it is.
 const DEPTH = STEP;
 
+// What a stage brings.
+const VALUES = STEP * TILE;
+const TAPS = STEP * BLOCKS * 4u;
+
 override STEPS: u32 = (IN_BLOCKS + STEP - 1u) / STEP;
+override STAGES: u32 = KERNEL * KERNEL * STEPS;
 override TILES: u32 = (HEIGHT * WIDTH + TILE - 1u) / TILE;
 override BLOCK_GROUPS: u32 = (OUT_BLOCKS + BLOCKS - 1u) / BLOCKS;
 
@@ -22,17 +27,29 @@ override BLOCK_GROUPS: u32 = (OUT_BLOCKS + BLOCKS - 1u) / BLOCKS;
 @group(0) @binding(3) var<storage, read> weights: array<vec4<f32>>;
 
 // [in block][pixel]
-var<workgroup> values: array<vec4<f32>, STEP * TILE>;
+var<workgroup> values: array<vec4<f32>, VALUES>;
 // [in block][out block][in channel] of four outputs
-var<workgroup> taps: array<vec4<f32>, STEP * BLOCKS * 4u>;
+var<workgroup> taps: array<vec4<f32>, TAPS>;
 
-// What a tap sees of a block of channels from `pixel`.
-fn seen(image: u32, block: u32, pixel: u32, tap: u32) -> vec4<f32> {
-    let at = seen_from(pixel, tap);
-    if block < IN_BLOCKS && is_inside(at) {
+// Of the workgroup.
+var<private> image: u32;
+var<private> first_block: u32;
+var<private> first_pixel: u32;
+
+// Number `index` of what a stage brings.
+fn value(stage: u32, index: u32) -> vec4<f32> {
+    let block = stage % STEPS * STEP + index / TILE;
+    let at = seen_from(first_pixel + index % TILE, stage / STEPS);
+    if index < VALUES && block < IN_BLOCKS && is_inside(at) {
         return input_at(block * BATCH + image, u32(at.y), u32(at.x));
     }
     return vec4(0.0);
+}
+
+fn weight(stage: u32, index: u32) -> vec4<f32> {
+    let i = min(index, TAPS - 1u);
+    let row = (stage * STEP + i / (BLOCKS * 4u)) * BLOCK_GROUPS * BLOCKS + first_block;
+    return weights[row * 4u + i % (BLOCKS * 4u)];
 }
 
 fn matrix(first: u32) -> mat4x4<f32> {
@@ -46,9 +63,9 @@ fn main(
     @builtin(local_invocation_index) local: u32,
 ) {
     let workgroup = group.y * groups.x + group.x;
-    let first_block = workgroup % BLOCK_GROUPS * BLOCKS;
-    let first_pixel = workgroup / BLOCK_GROUPS % TILES * TILE;
-    let image = workgroup / (BLOCK_GROUPS * TILES) % BATCH;
+    first_block = workgroup % BLOCK_GROUPS * BLOCKS;
+    first_pixel = workgroup / BLOCK_GROUPS % TILES * TILE;
+    image = workgroup / (BLOCK_GROUPS * TILES) % BATCH;
     let lane = local % LANES;
     let pair = local / LANES;
     let low_block = first_block + 2u * pair;
@@ -61,30 +78,42 @@ fn main(
         high[i] = bias[high_block];
     }
 
-    for (var tap = 0u; tap < KERNEL * KERNEL; tap++) {
-        for (var step = 0u; step < STEPS; step++) {
-            workgroupBarrier();
-            for (var n = 0u; n < STAGED; n++) {
-                let i = n * GROUP + local;
-                if i < STEP * TILE {
-                    let block = step * STEP + i / TILE;
-                    values[i] = seen(image, block, first_pixel + i % TILE, tap);
-                }
+    var next_values: array<vec4<f32>, VALUES_EACH>;
+    var next_taps: array<vec4<f32>, TAPS_EACH>;
+    for (var n = 0u; n < VALUES_EACH; n++) {
+        next_values[n] = value(0u, n * GROUP + local);
+    }
+    for (var n = 0u; n < TAPS_EACH; n++) {
+        next_taps[n] = weight(0u, n * GROUP + local);
+    }
+    for (var stage = 0u; stage < STAGES; stage++) {
+        workgroupBarrier();
+        for (var n = 0u; n < VALUES_EACH; n++) {
+            if n * GROUP + local < VALUES {
+                values[n * GROUP + local] = next_values[n];
             }
-            let first = (tap * STEPS + step) * STEP;
-            for (var i = local; i < STEP * BLOCKS * 4u; i += GROUP) {
-                let row = (first + i / (BLOCKS * 4u)) * BLOCK_GROUPS * BLOCKS + first_block;
-                taps[i] = weights[row * 4u + i % (BLOCKS * 4u)];
+        }
+        for (var n = 0u; n < TAPS_EACH; n++) {
+            if n * GROUP + local < TAPS {
+                taps[n * GROUP + local] = next_taps[n];
             }
-            workgroupBarrier();
-            for (var block = 0u; block < DEPTH; block++) {
-                let weight_low = matrix((block * BLOCKS + 2u * pair) * 4u);
-                let weight_high = matrix((block * BLOCKS + 2u * pair + 1u) * 4u);
-                for (var i = 0u; i < PIXELS; i++) {
-                    let value = values[block * TILE + i * LANES + lane];
-                    low[i] += weight_low * value;
-                    high[i] += weight_high * value;
-                }
+        }
+        workgroupBarrier();
+        if stage + 1u < STAGES {
+            for (var n = 0u; n < VALUES_EACH; n++) {
+                next_values[n] = value(stage + 1u, n * GROUP + local);
+            }
+            for (var n = 0u; n < TAPS_EACH; n++) {
+                next_taps[n] = weight(stage + 1u, n * GROUP + local);
+            }
+        }
+        for (var block = 0u; block < DEPTH; block++) {
+            let weight_low = matrix((block * BLOCKS + 2u * pair) * 4u);
+            let weight_high = matrix((block * BLOCKS + 2u * pair + 1u) * 4u);
+            for (var i = 0u; i < PIXELS; i++) {
+                let texel = values[block * TILE + i * LANES + lane];
+                low[i] += weight_low * texel;
+                high[i] += weight_high * texel;
             }
         }
     }

@@ -11,7 +11,7 @@ override STEP_Y: f32;
 
 override CELLS: u32 = INPUT_HEIGHT * INPUT_WIDTH;
 
-const LANES = 64u;
+const LANES = 256u;
 const LOWEST = -0x1.fffffep+127f;
 var<workgroup> maxima: array<f32, LANES>;
 // Weighted x, y and depth, and the weights.

@@ -63,9 +63,9 @@ fn kernels() -> Vec<Conv2dKernel> {
     here
 }
 
-/// One channel for the kernel that makes only one.
+/// One channel for the kernels that make only one.
 fn channels_for(kernel: Conv2dKernel, channels: usize) -> usize {
-    if kernel == Conv2dKernel::SubgroupOne {
+    if matches!(kernel, Conv2dKernel::SubgroupOne | Conv2dKernel::One) {
         1
     } else {
         channels

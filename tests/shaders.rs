@@ -19,7 +19,7 @@ use Layout::{Buffer, HalfBuffer};
 
 /// What the library composes from the files in `shaders/`, and the constants that these want in their text:
 /// a file that nobody lists is not tested. Some have no layout: they bind their textures themselves, or draw.
-const KERNELS: [Kernel; 27] = [
+const KERNELS: [Kernel; 28] = [
     (&["back_project"], &Layout::ALL, &[]),
     (&["concat"], &Layout::ALL, &[]),
     (
@@ -30,7 +30,18 @@ const KERNELS: [Kernel; 27] = [
     (
         &["conv2d_cooperative", "conv2d_planes", "conv2d_matrix"],
         &[HalfBuffer],
-        &[("STEP", 4)],
+        &[
+            ("WIDE", 32),
+            ("ROWS", 2),
+            ("STEP", 8),
+            ("SPLIT", 2),
+            ("SHARE", 1),
+            ("WAYS", 2),
+            ("SPAN", 1),
+            ("SEGMENT", 32),
+            ("VALUES_EACH", 1),
+            ("WEIGHTS_EACH", 2),
+        ],
     ),
     (
         &["conv2d_lattice", "conv2d_rows", "conv2d_subgroup"],
@@ -48,9 +59,20 @@ const KERNELS: [Kernel; 27] = [
         &[("ROWS", 3), ("KERNEL", 3)],
     ),
     (
+        &["conv2d_planes", "conv2d_one"],
+        &[Buffer, HalfBuffer],
+        &[("ROWS", 4), ("SIDE", 3)],
+    ),
+    (
         &["conv2d_planes", "conv2d_tiled"],
         &[Buffer, HalfBuffer],
-        &[("PIXELS", 4), ("PAIRS", 2), ("STEP", 2), ("STAGED", 4)],
+        &[
+            ("PIXELS", 4),
+            ("PAIRS", 2),
+            ("STEP", 2),
+            ("VALUES_EACH", 4),
+            ("TAPS_EACH", 1),
+        ],
     ),
     (&["coverage"], &Layout::ALL, &[]),
     (&["dense"], &Layout::ALL, &[]),
@@ -261,6 +283,7 @@ fn compile(language: Language, entry: &EntryPoint, translated: &[u8]) -> Result<
 /// glslang has not.
 const CLEARS_ARRAYS: [&str; 8] = [
     "conv2d_buffer",
+    "conv2d_one",
     "conv2d_subgroup",
     "conv2d_subgroup_one",
     "conv2d_texture",

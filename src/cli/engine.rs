@@ -20,7 +20,7 @@ pub(super) struct EngineArgs {
     /// The backends to search: vulkan, metal, dx12, gl
     #[arg(long, value_name = "NAME")]
     pub backend: Option<String>,
-    /// Do not look for the fastest kernels on this adapter, which takes some two seconds and is
+    /// Do not look for the fastest kernels on this adapter, which takes some five seconds and is
     /// remembered in the user's cache folder
     #[arg(long)]
     pub no_tuning: bool,

@@ -1,6 +1,8 @@
 use std::fmt;
 
-use super::conv2d::{Conv2d, Tiling, buffer, cooperative, subgroup_one, texture, tiled};
+use super::conv2d::{
+    Conv2d, Tiling, buffer, cooperative, cooperative_workgroups, one, subgroup_one, texture, tiled,
+};
 use super::layout::is_rasteriser;
 use super::step::Step;
 use super::{Device, GpuError, Layout, Tier};
@@ -14,8 +16,10 @@ pub enum Conv2dKernel {
     Subgroup,
     /// Between textures, without subgroups.
     Texture,
-    /// Between buffers of halves, on a GPU's matrix units.
-    Cooperative,
+    /// Between buffers of halves, on a GPU's matrix units, so many pixels a workgroup.
+    Cooperative(usize),
+    /// Between buffers to one channel: for GPUs.
+    One,
     /// Between buffers, through workgroup memory, so many pixels an invocation: for GPUs.
     Tiled(usize),
     /// Between buffers, on everything.
@@ -24,14 +28,18 @@ pub enum Conv2dKernel {
 
 impl Conv2dKernel {
     /// Every kernel, the better before the more general.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 12] = [
         Self::SubgroupOne,
         Self::Subgroup,
         Self::Texture,
-        Self::Cooperative,
+        Self::One,
+        Self::Cooperative(128),
+        Self::Cooperative(64),
+        Self::Cooperative(32),
         Self::Tiled(8),
         Self::Tiled(4),
         Self::Tiled(2),
+        Self::Tiled(1),
         Self::Buffer,
     ];
 
@@ -39,8 +47,8 @@ impl Conv2dKernel {
     pub fn layouts(self) -> &'static [Layout] {
         match self {
             Self::SubgroupOne | Self::Subgroup | Self::Texture => &[Layout::Texture],
-            Self::Cooperative => &[Layout::HalfBuffer],
-            Self::Tiled(_) | Self::Buffer => &[Layout::Buffer, Layout::HalfBuffer],
+            Self::Cooperative(_) => &[Layout::HalfBuffer],
+            Self::One | Self::Tiled(_) | Self::Buffer => &[Layout::Buffer, Layout::HalfBuffer],
         }
     }
 
@@ -57,10 +65,12 @@ impl Conv2dKernel {
                 Some(size) => Some(format!("subgroups of {size}, 8 needed")),
                 None => Some("no subgroups, 8 needed".into()),
             },
-            Self::Cooperative if device.tier() < Tier::CooperativeMatrix => {
+            Self::Cooperative(_) if device.tier() < Tier::CooperativeMatrix => {
                 Some("no matrix units for 16 x 16 halves".into())
             }
-            Self::Cooperative | Self::Texture | Self::Tiled(_) | Self::Buffer => None,
+            Self::One | Self::Cooperative(_) | Self::Texture | Self::Tiled(_) | Self::Buffer => {
+                None
+            }
         }
     }
 
@@ -71,18 +81,24 @@ impl Conv2dKernel {
                 let reaches = conv.input.margin() >= Some(conv.reach());
                 reaches && conv.kernel <= 7 && conv.output.shape.channels == 1
             }
+            Self::One => conv.kernel <= 7 && conv.output.shape.channels == 1,
             _ => true,
         };
         fits && self.layouts().contains(&conv.input.layout())
     }
 
-    /// Whether it is the better choice where nothing was measured. What was never run is not, and on CPU
-    /// rasterisers workgroup memory is slower than any other; for a large GPU there should be workgroups enough.
+    /// Whether it is the better choice where nothing was measured. What is not known to be right on the adapter is
+    /// not, and on CPU rasterisers workgroup memory is slower than any other; for a large GPU there should be
+    /// workgroups enough.
     fn suits(self, device: &Device, conv: &Conv2d<'_>) -> bool {
         match self {
-            Self::Cooperative => false,
+            Self::Cooperative(pixels) => {
+                let enough = pixels == 32 || cooperative_workgroups(device, conv, pixels) >= 256;
+                enough && known(device, self)
+            }
+            Self::One => !is_rasteriser(device.info()),
             Self::Tiled(pixels) => {
-                let enough = pixels == 2 || Tiling::new(conv, pixels).workgroups() >= 256;
+                let enough = pixels == 1 || Tiling::new(conv, pixels).workgroups() >= 256;
                 enough && !is_rasteriser(device.info())
             }
             _ => true,
@@ -96,7 +112,8 @@ impl fmt::Display for Conv2dKernel {
             Self::SubgroupOne => f.write_str("conv2d_subgroup_one"),
             Self::Subgroup => f.write_str("conv2d_subgroup"),
             Self::Texture => f.write_str("conv2d_texture"),
-            Self::Cooperative => f.write_str("conv2d_cooperative"),
+            Self::One => f.write_str("conv2d_one"),
+            Self::Cooperative(pixels) => write!(f, "conv2d_cooperative/{pixels}"),
             Self::Tiled(pixels) => write!(f, "conv2d_tiled/{pixels}"),
             Self::Buffer => f.write_str("conv2d_buffer"),
         }
@@ -145,6 +162,17 @@ fn tuned(
     }
 }
 
+/// Whether the device's tuner found `kernel` to answer rightly.
+fn known(device: &Device, kernel: Conv2dKernel) -> bool {
+    #[cfg(not(target_arch = "wasm32"))]
+    return device.tuner().knows(kernel);
+    #[cfg(target_arch = "wasm32")]
+    {
+        let _ = (device, kernel);
+        false
+    }
+}
+
 /// A convolution by a `kernel` that serves it.
 pub(super) fn by(
     kernel: Conv2dKernel,
@@ -155,7 +183,8 @@ pub(super) fn by(
         Conv2dKernel::SubgroupOne => subgroup_one(device, conv),
         Conv2dKernel::Subgroup => texture(device, conv, true),
         Conv2dKernel::Texture => texture(device, conv, false),
-        Conv2dKernel::Cooperative => cooperative(device, conv),
+        Conv2dKernel::One => one(device, conv),
+        Conv2dKernel::Cooperative(pixels) => cooperative(device, conv, pixels),
         Conv2dKernel::Tiled(pixels) => tiled(device, conv, pixels),
         Conv2dKernel::Buffer => buffer(device, conv),
     }

@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::adapter::{self, AdapterRequest, Choice};
 use super::loss::Loss;
 use super::mapping::Mapping;
-use super::pipelines::Pipelines;
+use super::pipelines::{Checks, Pipelines};
 #[cfg(not(target_arch = "wasm32"))]
 use super::tuner::Tuner;
 use super::{GpuError, Layout, Precision, Tier};
@@ -46,7 +46,7 @@ impl Device {
     pub const TIMEOUT: Duration = Duration::from_secs(60);
 
     /// What commands spend on [`Device::tuned`].
-    pub const TUNING: Duration = Duration::from_secs(2);
+    pub const TUNING: Duration = Duration::from_secs(5);
 
     /// What is asked for where the adapter has it.
     const FEATURES: wgpu::Features = wgpu::Features::SUBGROUP
@@ -261,9 +261,10 @@ impl Device {
         text: String,
         entry_point: &str,
         constants: &[(&str, f64)],
+        checks: Checks,
     ) -> wgpu::ComputePipeline {
         self.pipelines
-            .get(&self.device, label, text, entry_point, constants)
+            .get(&self.device, label, text, entry_point, constants, checks)
     }
 
     /// Gives the first fault that happened since the device was opened.

@@ -11,8 +11,18 @@ pub(super) struct Pipelines {
     cache: Option<wgpu::PipelineCache>,
 }
 
-/// A kernel's text, its entry point, and the bits of its constants.
-type Key = (String, String, Vec<(String, u64)>);
+/// A kernel's text, its entry point, the bits of its constants, and whether it is checked.
+type Key = (String, String, Vec<(String, u64)>, Checks);
+
+/// What wgpu adds to a kernel so that none reaches beyond its memory, reads workgroup memory that nobody wrote,
+/// divides by zero or runs for ever. In the inner loops of a GPU it costs much.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) enum Checks {
+    /// Kept: where a kernel leans on them, or gains nothing.
+    Kept,
+    /// Left out: the kernel does nothing of the kind.
+    Left,
+}
 
 impl Pipelines {
     /// With what [`Self::memory`] gave in an earlier process; what is foreign or damaged is passed over.
@@ -55,20 +65,31 @@ impl Pipelines {
         text: String,
         entry_point: &str,
         constants: &[(&str, f64)],
+        checks: Checks,
     ) -> wgpu::ComputePipeline {
         let bits = constants
             .iter()
             .map(|(name, value)| ((*name).to_owned(), value.to_bits()))
             .collect();
-        let key = (text, entry_point.to_owned(), bits);
+        let key = (text, entry_point.to_owned(), bits, checks);
         let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(pipeline) = made.get(&key) {
             return pipeline.clone();
         }
-        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+        let source = wgpu::ShaderModuleDescriptor {
             label: Some(label),
             source: wgpu::ShaderSource::Wgsl(key.0.as_str().into()),
-        });
+        };
+        let module = match checks {
+            Checks::Kept => device.create_shader_module(source),
+            // SAFETY: only this library's own kernels come here, by `Step::trusted`, whose callers answer for what
+            // the checks are for; where they lie in buffers, Vulkan and Direct3D keep them there all the same.
+            #[allow(unsafe_code)]
+            Checks::Left => unsafe {
+                let unchecked = wgpu::ShaderRuntimeChecks::unchecked();
+                device.create_shader_module_trusted(source, unchecked)
+            },
+        };
         let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
             label: Some(label),
             layout: None,
@@ -76,7 +97,7 @@ impl Pipelines {
             entry_point: Some(entry_point),
             compilation_options: wgpu::PipelineCompilationOptions {
                 constants,
-                ..Default::default()
+                zero_initialize_workgroup_memory: checks == Checks::Kept,
             },
             cache: self.cache.as_ref(),
         });

@@ -14,7 +14,7 @@ pub(super) fn soft_argmax2d(
     step: [f32; 2],
 ) -> Result<Step, GpuError> {
     let tensors = Tensors::both_to(heat, votes, output);
-    Step::new(
+    Step::trusted(
         device,
         &StepDescriptor {
             label,

@@ -1,3 +1,4 @@
+use super::pipelines::Checks;
 use super::tensor::Tensor;
 use super::{Device, GpuError, Layout, kernel_text};
 
@@ -134,6 +135,21 @@ impl Step {
     /// Compiles the kernel and binds its resources. Driver errors reach the caller's
     /// [`Device::scoped`].
     pub(super) fn new(device: &Device, step: &StepDescriptor<'_>) -> Result<Self, GpuError> {
+        Self::checked(device, step, Checks::Kept)
+    }
+
+    /// The same for a kernel that, whatever the numbers in its tensors, stays within what it binds and within its
+    /// arrays, writes workgroup memory before it reads it, divides by no zero, and ends: it runs without wgpu's
+    /// checks of that.
+    pub(super) fn trusted(device: &Device, step: &StepDescriptor<'_>) -> Result<Self, GpuError> {
+        Self::checked(device, step, Checks::Left)
+    }
+
+    fn checked(
+        device: &Device,
+        step: &StepDescriptor<'_>,
+        checks: Checks,
+    ) -> Result<Self, GpuError> {
         let geometry = step.tensors.constants();
         let constants: Vec<(&str, f64)> = geometry
             .iter()
@@ -141,7 +157,7 @@ impl Step {
             .chain(step.constants.iter().copied())
             .collect();
         let text = kernel_text(step.tensors.layout(), step.sizes, step.source);
-        let pipeline = device.pipeline(step.label, text, step.entry_point, &constants);
+        let pipeline = device.pipeline(step.label, text, step.entry_point, &constants, checks);
         let bind_group = bind(device, &pipeline, step.tensors, step.bindings);
         // A dimension holds 65,535 workgroups at most: long dispatches are folded into rows.
         let row = device.wgpu().limits().max_compute_workgroups_per_dimension as usize;

@@ -253,7 +253,7 @@ impl Tensor {
         Ok(())
     }
 
-    /// Writes numbers in [-1, 1), some of which repeat, at the queue's next submission. For buffers.
+    /// Writes numbers in [-1, 1), some of which repeat. For buffers.
     #[cfg(not(target_arch = "wasm32"))]
     pub(super) fn fill(&self, device: &Device) {
         let Memory::Buffer { buffer, offset, .. } = &self.memory else {
@@ -269,12 +269,21 @@ impl Tensor {
                 .flat_map(|v| f16::from_f32(v).to_le_bytes())
                 .collect()
         };
+        // A batch's input is hundreds of megabytes: one piece goes to the device, and copies of it stay there.
+        let piece = device.wgpu().create_buffer(&wgpu::BufferDescriptor {
+            label: Some("numbers"),
+            size: bytes.len() as u64,
+            usage: wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        device.queue().write_buffer(&piece, 0, &bytes);
+        let mut encoder = device.wgpu().create_command_encoder(&Default::default());
         let end = offset + (self.texel_size() * self.texels()) as u64;
         for at in (*offset..end).step_by(bytes.len()) {
-            let rest = (end - at).min(bytes.len() as u64) as usize;
-            let piece = bytes.get(..rest).unwrap_or_default();
-            device.queue().write_buffer(buffer, at, piece);
+            let rest = (end - at).min(piece.size());
+            encoder.copy_buffer_to_buffer(&piece, 0, buffer, at, rest);
         }
+        device.queue().submit([encoder.finish()]);
     }
 
     /// Numbers from all over it, as they lie in memory. For buffers. Waits for what was submitted before.
@@ -480,7 +489,20 @@ pub(super) fn constant_buffer(
     what: &str,
     values: &[f32],
 ) -> Result<wgpu::Buffer, GpuError> {
-    let bytes: &[u8] = bytemuck::cast_slice(values);
+    constant_bytes(device, what, bytemuck::cast_slice(values))
+}
+
+/// The same, rounded to halves.
+pub(super) fn constant_halves(
+    device: &Device,
+    what: &str,
+    values: &[f32],
+) -> Result<wgpu::Buffer, GpuError> {
+    let halves: Vec<f16> = values.iter().copied().map(f16::from_f32).collect();
+    constant_bytes(device, what, bytemuck::cast_slice(&halves))
+}
+
+fn constant_bytes(device: &Device, what: &str, bytes: &[u8]) -> Result<wgpu::Buffer, GpuError> {
     let buffer = storage_buffer(device, what, bytes.len() as u64)?;
     device.queue().write_buffer(&buffer, 0, bytes);
     Ok(buffer)

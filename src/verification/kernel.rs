@@ -175,7 +175,7 @@ impl Kernel {
                 // A kernel that shares rows wants a margin as wide as it reaches.
                 let most = input.height.max(input.width).div_ceil(side / 2 + 1);
                 let out_channels = match kernel {
-                    Conv2dKernel::SubgroupOne => 1,
+                    Conv2dKernel::SubgroupOne | Conv2dKernel::One => 1,
                     _ => case.random.of(&CHANNELS),
                 };
                 let operation = Operation::Conv2d {
@@ -186,7 +186,7 @@ impl Kernel {
                 };
                 let halves = match kernel {
                     // Its weights are halves too.
-                    Conv2dKernel::Cooperative => 2e-3,
+                    Conv2dKernel::Cooperative(_) => 2e-3,
                     _ => 0.0,
                 };
                 (operation, rounding_of_sum(channels * side * side) + halves)

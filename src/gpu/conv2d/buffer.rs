@@ -30,7 +30,7 @@ pub fn buffer(device: &Device, conv: &Conv2d<'_>) -> Result<Step, GpuError> {
         conv,
         ("conv2d_buffer", source),
         &[],
-        &weights,
+        &[(3, conv.weights(device, &weights)?.as_entire_binding())],
         out_blocks,
         invocations.div_ceil(64),
     )

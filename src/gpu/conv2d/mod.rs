@@ -3,12 +3,14 @@
 
 mod buffer;
 mod cooperative;
+mod one;
 mod subgroup_one;
 mod texture;
 mod tiled;
 
 pub(super) use buffer::buffer;
-pub(super) use cooperative::cooperative;
+pub(super) use cooperative::{cooperative, workgroups as cooperative_workgroups};
+pub(super) use one::one;
 pub(super) use subgroup_one::subgroup_one;
 pub(super) use texture::texture;
 pub(super) use tiled::{Tiling, tiled};
@@ -47,6 +49,11 @@ impl Conv2d<'_> {
         )
     }
 
+    /// `packed` weights in f32.
+    fn weights(&self, device: &Device, packed: &[f32]) -> Result<wgpu::Buffer, GpuError> {
+        constant_buffer(device, &format!("{}: weight", self.label), packed)
+    }
+
     /// The weights that `place` gives a place among `len` values of zero, by output channel, input
     /// channel, kernel row and kernel column.
     fn packed(&self, len: usize, place: impl Fn([usize; 4]) -> usize) -> Vec<f32> {
@@ -82,21 +89,23 @@ impl Conv2d<'_> {
 }
 
 /// A step of a `kernel` between buffers, `source` with `shaders/conv2d_planes.wgsl` in front, which makes
-/// `out_blocks` blocks of output channels, those beyond the last of zeros.
+/// `out_blocks` blocks of output channels, those beyond the last of zeros. `bindings` are its weights (3) and
+/// what else it binds.
 fn planes(
     device: &Device,
     conv: &Conv2d<'_>,
     (kernel, source): (&'static str, &str),
     sizes: &[(&str, usize)],
-    weights: &[f32],
+    bindings: &[(u32, wgpu::BindingResource<'_>)],
     out_blocks: usize,
     workgroups: usize,
 ) -> Result<Step, GpuError> {
     let label = conv.label;
-    let weights = constant_buffer(device, &format!("{label}: weight"), weights)?;
     let bias = conv.padded_bias(out_blocks);
     let bias = constant_buffer(device, &format!("{label}: bias"), &bias)?;
-    Step::new(
+    let mut bindings = bindings.to_vec();
+    bindings.push((4, bias.as_entire_binding()));
+    Step::trusted(
         device,
         &StepDescriptor {
             label,
@@ -110,10 +119,7 @@ fn planes(
                 ("ACTIVATION", activation_number(conv.activation).into()),
             ],
             sizes,
-            bindings: &[
-                (3, weights.as_entire_binding()),
-                (4, bias.as_entire_binding()),
-            ],
+            bindings: &bindings,
             workgroups,
             work: conv.work(),
         },

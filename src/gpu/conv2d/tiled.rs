@@ -28,7 +28,8 @@ impl Tiling {
         let in_blocks = blocks(conv.input.shape.channels);
         let out_blocks = blocks(shape.channels);
         let pairs = out_blocks.div_ceil(2).next_power_of_two().min(4);
-        let step = in_blocks.min(pairs);
+        // Few pixels leave room to bring more at a time, and wait for it less often.
+        let step = in_blocks.min(pairs * (4 / pixels).max(1));
         let tile = GROUP / pairs * pixels;
         Self {
             pixels,
@@ -50,6 +51,7 @@ impl Tiling {
 /// need few reads, few make more workgroups.
 pub fn tiled(device: &Device, conv: &Conv2d<'_>, pixels: usize) -> Result<Step, GpuError> {
     let tiling = Tiling::new(conv, pixels);
+    let weights = conv.packed_matrices(tiling.padded_in, tiling.padded_out);
     let source = concat!(
         include_str!("../../../shaders/conv2d_planes.wgsl"),
         include_str!("../../../shaders/conv2d_tiled.wgsl")
@@ -62,9 +64,13 @@ pub fn tiled(device: &Device, conv: &Conv2d<'_>, pixels: usize) -> Result<Step, 
             ("PIXELS", tiling.pixels),
             ("PAIRS", tiling.pairs),
             ("STEP", tiling.step),
-            ("STAGED", (tiling.step * tiling.tile).div_ceil(GROUP)),
+            ("VALUES_EACH", (tiling.step * tiling.tile).div_ceil(GROUP)),
+            (
+                "TAPS_EACH",
+                (tiling.step * tiling.pairs * 8).div_ceil(GROUP),
+            ),
         ],
-        &conv.packed_matrices(tiling.padded_in, tiling.padded_out),
+        &[(3, conv.weights(device, &weights)?.as_entire_binding())],
         tiling.padded_out,
         tiling.workgroups(),
     )
