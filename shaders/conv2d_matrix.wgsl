@@ -159,10 +159,10 @@ fn main(
         for (var tap = 0u; tap < SPAN; tap++) {
             for (var k = 0u; k < SHARE; k++) {
                 let depth = part * SHARE + k;
-                let seen = tap * DILATION * VALUES_STRIDE + 4u * depth;
+                let shift = tap * DILATION * VALUES_STRIDE + 4u * depth;
                 let weight = (tap * STEP * 4u + 16u * depth) * TAPS_STRIDE + 8u * way;
-                let above = values_at(first_above + seen);
-                let below = values_at(first_below + seen);
+                let above = values_at(first_above + shift);
+                let below = values_at(first_below + shift);
                 let left = taps_at(weight);
                 let right = taps_at(weight + 4u);
                 upper_left = multiply_add(above, left, upper_left);
