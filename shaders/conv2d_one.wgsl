@@ -7,6 +7,7 @@ const LANES = 32u;
 const PARTS = 4u;
 const GROUP = LANES * PARTS;
 
+override STEPS: u32 = (IN_BLOCKS + PARTS - 1u) / PARTS;
 override TILES_ACROSS: u32 = (WIDTH + LANES - 1u) / LANES;
 // Rows that do not lie on one lattice share nothing.
 override LATTICE: u32 = min(DILATION, HEIGHT);
@@ -40,7 +41,12 @@ fn main(
 
     let first = vec2(i32(x), i32(y)) - i32(KERNEL / 2u * DILATION);
     var totals: array<vec4<f32>, ROWS>;
-    for (var block = part; block < IN_BLOCKS; block += PARTS) {
+    // Not from `part` on: SwiftShader unrolls such a loop without end.
+    for (var step = 0u; step < STEPS; step++) {
+        let block = step * PARTS + part;
+        if block >= IN_BLOCKS {
+            break;
+        }
         let plane = block * BATCH + image;
         for (var kx = 0u; kx < SIDE; kx++) {
             var values: array<vec4<f32>, ROWS + SIDE - 1u>;
@@ -59,14 +65,14 @@ fn main(
         sums[part * ROWS * LANES + row * LANES + local % LANES] = dot(totals[row], vec4(1.0));
     }
     workgroupBarrier();
-    for (var row = part; row < ROWS; row += PARTS) {
+    // A row a part; ROWS are no more than PARTS.
+    let row = part;
+    let to = y + row * LATTICE;
+    if row < ROWS && x < WIDTH && to < HEIGHT {
         var sum = bias[0].x;
         for (var other = 0u; other < PARTS; other++) {
             sum += sums[other * ROWS * LANES + row * LANES + local % LANES];
         }
-        let to = y + row * LATTICE;
-        if x < WIDTH && to < HEIGHT {
-            output_set(image, to, x, activate(vec4(sum, 0.0, 0.0, 0.0)));
-        }
+        output_set(image, to, x, activate(vec4(sum, 0.0, 0.0, 0.0)));
     }
 }
