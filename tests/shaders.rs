@@ -281,7 +281,7 @@ fn compile(language: Language, entry: &EntryPoint, translated: &[u8]) -> Result<
 
 /// Kernels that naga clears arrays in, in HLSL by a cast of 0. Microsoft's compilers have that cast,
 /// glslang has not.
-const CLEARS_ARRAYS: [&str; 8] = [
+const CLEARS_ARRAYS: [&str; 9] = [
     "conv2d_buffer",
     "conv2d_one",
     "conv2d_subgroup",
