@@ -124,7 +124,7 @@ fn gives_what_single_images_give(model: &Model) {
     // Negative control: the images differ.
     assert!(difference(&together[0].mask, &together[1].mask).unwrap() > 1e-3);
     assert!(matches!(
-        Plan::new(&device, &model, 1, Precision::F32)
+        Plan::new(&device, model, 1, Precision::F32)
             .unwrap()
             .write(
                 &device,

@@ -63,9 +63,10 @@ class Case:
 
     def __init__(self, weights, images, folder):
         folder.mkdir(parents=True, exist_ok=True)
-        self.weights, self.folder = weights.resolve(), folder
+        self.weights, self.folder = folder / weights.name, folder
+        export.without_zoom(weights, self.weights)
         self.onnx = folder / "cascade.onnx"
-        self.description = export.export(weights, self.onnx)
+        self.description = export.export(self.weights, self.onnx)
         size = self.description["input"]
         self.width, self.height = size["width"], size["height"]
         self.joints = len(self.description["joints"])

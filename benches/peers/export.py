@@ -11,6 +11,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 from safetensors import safe_open
+from safetensors.numpy import save_file
 
 # Old enough for every importer here.
 OPSET, IR_VERSION = 17, 8
@@ -21,6 +22,15 @@ def read_model(path):
     with safe_open(path, framework="numpy") as file:
         description = json.loads(file.metadata()["whereabot"])
         return description, {key: file.get_tensor(key).astype(np.float32) for key in file.keys()}
+
+
+def without_zoom(path, copy):
+    """Copies a model file, but for what turns the joint network's camera: peers run the networks, which cost the same."""
+    with safe_open(path, framework="numpy") as file:
+        metadata, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}
+    description = json.loads(metadata["whereabot"])
+    description.pop("zoom", None)
+    save_file(tensors, copy, metadata | {"whereabot": json.dumps(description)})
 
 
 class Graph:
