@@ -124,19 +124,17 @@ fn gives_what_single_images_give(model: &Model) {
     // Negative control: the images differ.
     assert!(difference(&together[0].mask, &together[1].mask).unwrap() > 1e-3);
     assert!(matches!(
-        Plan::new(&device, model, 1, Precision::F32)
-            .unwrap()
-            .write(
-                &device,
-                1,
-                &picture(48, 40, 1),
-                &Rectification::new(
-                    &Camera::from_hfov(48, 40, 1.0),
-                    &model.description.camera,
-                    48,
-                    40
-                )
-            ),
+        Plan::new(&device, model, 1, Precision::F32).unwrap().write(
+            &device,
+            1,
+            &picture(48, 40, 1),
+            &Rectification::new(
+                &Camera::from_hfov(48, 40, 1.0),
+                &model.description.camera,
+                48,
+                40
+            )
+        ),
         Err(GpuError::Size { .. })
     ));
 }
