@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use image::{Rgb, RgbImage, RgbaImage};
 use whereabot::camera::Camera;
-use whereabot::cascade::{Estimate, Locator, Output, Status};
+use whereabot::cascade::{Estimate, Joint, Locator, Output, Status};
 use whereabot::draw::mask_image;
 use whereabot::gpu::{AdapterRequest, Device, Precision};
 use whereabot::network::Model;
@@ -59,11 +59,17 @@ fn headless_host_prints_the_joints() {
         let found: Vec<f64> = xyz.split_whitespace().flat_map(str::parse).collect();
         for (found, expected) in found.iter().zip(joint.xyz_m) {
             // Its texture is sRGB, which drivers decode to within half a step of eight bits: a pixel of the
-            // mask more or less is some millimetres.
-            assert!((found - expected).abs() < 0.005, "{line}: {expected}");
+            // mask more or less is a centimetre or two. Where it matters, tests/host.rs compares alike images.
+            assert!((found - expected).abs() < 0.03, "{line}: {expected}");
         }
     }
     assert_eq!(text.lines().count(), 7, "{text}");
+    // Negative control: another picture's joints are not near.
+    let image = bundled("ur5_2.jpg").0;
+    let other = located(&model, &image, &camera);
+    let distance = |(a, b): (&Joint, &Joint)| (a.xyz_m[2] - b.xyz_m[2]).abs();
+    let pairs = expected.joints.iter().zip(&other.joints);
+    assert!(pairs.map(distance).fold(0.0, f64::max) > 0.1);
 }
 
 #[test]

@@ -12,6 +12,7 @@ use whereabot::cascade::{Locator, Output, Status};
 use whereabot::draw;
 use whereabot::gpu::Precision;
 use whereabot::network::Model;
+use whereabot::reference;
 
 fn root(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
@@ -83,6 +84,15 @@ fn gpu_and_reference_agree_on_photos() {
     }
 }
 
+/// Which pixels the joint network is shown behind a mask.
+fn shown(model: &Model, probability: &[f32]) -> Vec<bool> {
+    let one = model.mask_network.output();
+    let mask = reference::Tensor::new(one, probability.to_vec()).unwrap();
+    let white = reference::Tensor::full(one, 1.0);
+    let (seen, _) = reference::joint_input(&white, &mask, &model.description);
+    seen.data().iter().map(|v| *v > 0.0).collect()
+}
+
 #[test]
 fn halves_say_the_same() {
     // A pixel that crosses the overlay's threshold is in or out, and moves joints by up to three millimetres;
@@ -98,15 +108,20 @@ fn halves_say_the_same() {
                     .locate(&sample(image), &camera(), WITH_MASK)
                     .unwrap();
                 let threshold = model.description.presence.mask_threshold;
-                let mask = estimate.mask.as_ref().unwrap().probability.iter();
-                let mask: Vec<bool> = mask.map(|p| *p >= threshold).collect();
-                (estimate.status, mask, joints(&estimate))
+                let probability = &estimate.mask.as_ref().unwrap().probability;
+                let mask: Vec<bool> = probability.iter().map(|p| *p >= threshold).collect();
+                (
+                    estimate.status,
+                    mask,
+                    joints(&estimate),
+                    shown(&model, probability),
+                )
             });
             assert_eq!(full.0, half.0, "{name}, {image}");
             let overlap = iou(&full.1, &half.1);
             assert!(overlap >= 0.99, "{name}, {image}: IoU {overlap}");
             let metres = difference(&full.2, &half.2).unwrap();
-            let crossed = full.1.iter().zip(&half.1).filter(|(a, b)| a != b).count();
+            let crossed = full.3.iter().zip(&half.3).filter(|(a, b)| a != b).count();
             println!(
                 "{name}, {image}: IoU {overlap:.4}, {crossed} pixels crossed, joints differ by {metres} m"
             );
