@@ -13,7 +13,7 @@ override TILES_ACROSS: u32 = (WIDTH + LANES - 1u) / LANES;
 override LATTICE: u32 = min(DILATION, HEIGHT);
 override TILES_DOWN: u32 = (HEIGHT + LATTICE * ROWS - 1u) / (LATTICE * ROWS) * LATTICE;
 
-// [in block][kernel column][kernel row] of four input channels
+// [in block, to full steps][kernel column][kernel row] of four input channels
 @group(0) @binding(3) var<storage, read> weights: array<vec4<f32>>;
 
 // [part][row][column]
@@ -41,14 +41,12 @@ fn main(
 
     let first = vec2(i32(x), i32(y)) - i32(KERNEL / 2u * DILATION);
     var totals: array<vec4<f32>, ROWS>;
-    // Not from `part` on: SwiftShader unrolls such a loop without end.
+    // Not from `part` to IN_BLOCKS: SwiftShader unrolls such a loop without end. Weights beyond are zeros.
     for (var step = 0u; step < STEPS; step++) {
         let block = step * PARTS + part;
-        if block >= IN_BLOCKS {
-            break;
-        }
-        let plane = block * BATCH + image;
-        for (var kx = 0u; kx < SIDE; kx++) {
+        let plane = min(block, IN_BLOCKS - 1u) * BATCH + image;
+        // Not written out: software drivers take minutes to compile that.
+        for (var kx = 0u; kx < KERNEL; kx++) {
             var values: array<vec4<f32>, ROWS + SIDE - 1u>;
             for (var row = 0u; row < ROWS + SIDE - 1u; row++) {
                 values[row] = seen(plane, first + vec2(i32(kx * DILATION), i32(row * DILATION)));
