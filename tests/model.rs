@@ -137,7 +137,7 @@ fn a_file_of_another_network_is_refused() {
 #[test]
 fn descriptions_that_mean_something_else_are_refused() {
     type Change = fn(&mut Value);
-    let changes: [(Change, &[&str]); 14] = [
+    let changes: [(Change, &[&str]); 17] = [
         (
             |d| d["version"] = json!(2),
             &["version: expected 1, found 2"],
@@ -172,6 +172,18 @@ fn descriptions_that_mean_something_else_are_refused() {
             &["conv1"],
         ),
         (|d| d["mask_network"]["layers"] = json!([]), &["layers"]),
+        (
+            |d| d["zoom"] = json!({"spread": 0, "least": 0.5, "most": 4}),
+            &["zoom", "0.01", "spread 0"],
+        ),
+        (
+            |d| d["zoom"] = json!({"spread": 5, "least": 5, "most": 4}),
+            &["zoom", "least 5", "most 4"],
+        ),
+        (
+            |d| d["zoom"] = json!({"spread": 5, "least": 0.5}),
+            &["most"],
+        ),
         (|d| d["input"]["width"] = json!(0), &["input", "0 x 16"]),
         (
             |d| d["input"]["width"] = json!(4_000_000_000_u32),
