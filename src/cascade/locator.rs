@@ -210,7 +210,8 @@ impl Locator {
                 let image = reference::rectify(image, &rectification, shape.height, shape.width);
                 let mask = reference::Tensor::new(shape, mask.probability.clone())
                     .ok_or(LocateError::Shape("mask network"))?;
-                reference_joints(model, &image, &mask)?
+                reference::joints(model, &image, &mask)
+                    .ok_or(LocateError::Shape("joint network"))?
             }
         };
         let joints = values.as_chunks().0.iter();
@@ -242,7 +243,7 @@ fn run_reference(
     let joints = if output.mask_only {
         Vec::new()
     } else {
-        reference_joints(model, &image, &mask)?
+        reference::joints(model, &image, &mask).ok_or(LocateError::Shape("joint network"))?
     };
     Ok(Frame {
         coverage,
@@ -252,19 +253,5 @@ fn run_reference(
         } else {
             Vec::new()
         },
-    })
-}
-
-pub(crate) fn reference_joints(
-    model: &Model,
-    image: &reference::Tensor,
-    mask: &reference::Tensor,
-) -> Result<Vec<f32>, LocateError> {
-    let (masked, gaze) = reference::joint_input(image, mask, &model.description);
-    let joints =
-        reference::run(&model.joint_network, &masked).ok_or(LocateError::Shape("joint network"))?;
-    Ok(match gaze {
-        Some(gaze) => reference::zoom_joints(joints.data(), &gaze),
-        None => joints.data().to_vec(),
     })
 }

@@ -17,5 +17,4 @@ pub use host::{HostLocator, HostOptions, Located, MaskSize, Source};
 pub(crate) use line::EstimateLine;
 #[cfg(feature = "cli")]
 pub(crate) use line::rounded;
-pub(crate) use locator::reference_joints;
 pub use locator::{LocateError, Locator, Output};

@@ -157,33 +157,15 @@ struct Found {
 }
 
 /// The fastest of those of `candidates`, in their order, that are compiled by the `deadline`.
+///
+/// They are timed in rounds, one after the other without a pause: while the CPU compiles, a GPU lowers its clock (an H200 to a
+/// quarter), and whichever came first would win.
 fn fastest(
     device: &Device,
     conv: &Conv2d<'_>,
     candidates: &[Conv2dKernel],
     deadline: Instant,
 ) -> Result<Found, GpuError> {
-    let (contestants, of_all) = race(device, conv, candidates, deadline)?;
-    for Contestant { kernel, time, .. } in &contestants {
-        log::debug!("{}: {}, `{kernel}`: {time:?}", conv.label, describe(conv));
-    }
-    let best = contestants.iter().min_by_key(|contestant| contestant.time);
-    Ok(Found {
-        kernel: best.map(|best| best.kernel),
-        of_all,
-    })
-}
-
-/// Times those of `candidates` that are compiled by the `deadline`, and says whether those are all.
-///
-/// In rounds, one after the other without a pause: while the CPU compiles, a GPU lowers its clock (an H200 to a
-/// quarter), and whichever came first would win.
-fn race(
-    device: &Device,
-    conv: &Conv2d<'_>,
-    candidates: &[Conv2dKernel],
-    deadline: Instant,
-) -> Result<(Vec<Contestant>, bool), GpuError> {
     conv.input.fill(device);
     let expected = answer(device, conv)?;
     let mut contestants = Vec::new();
@@ -222,7 +204,14 @@ fn race(
             };
         }
     }
-    Ok((contestants, of_all))
+    for Contestant { kernel, time, .. } in &contestants {
+        log::debug!("{}: {}, `{kernel}`: {time:?}", conv.label, describe(conv));
+    }
+    let best = contestants.iter().min_by_key(|contestant| contestant.time);
+    Ok(Found {
+        kernel: best.map(|best| best.kernel),
+        of_all,
+    })
 }
 
 /// What the plainest kernel makes of what the layer reads.
@@ -339,62 +328,5 @@ mod tests {
         let tuner = Tuner::new(Duration::from_secs(60), device.info(), b"");
         // It binds textures, and gets buffers.
         assert_eq!(choose(&device, &tuner, &[Subgroup, Buffer]), Some(Buffer));
-    }
-
-    #[test]
-    #[ignore = "prints times, for whoever changes a kernel: minutes on a CPU"]
-    fn every_kernel_is_timed() {
-        let device = Device::open(&AdapterRequest::new(None, None)).unwrap();
-        // Channels, channels made, height, width, kernel, dilation: layers of both families.
-        let layers = [
-            [3, 32, 212, 256, 3, 1],
-            [32, 32, 212, 256, 3, 3],
-            [32, 32, 212, 256, 3, 9],
-            [32, 32, 212, 256, 3, 27],
-            [32, 1, 212, 256, 3, 1],
-            [32, 64, 53, 64, 3, 2],
-            [64, 128, 13, 16, 3, 4],
-            [16, 32, 106, 128, 3, 1],
-            [64, 16, 106, 128, 3, 1],
-            [64, 64, 53, 64, 3, 1],
-            [64, 64, 53, 64, 3, 16],
-            [64, 32, 53, 64, 1, 1],
-            [128, 128, 26, 32, 3, 2],
-            [128, 128, 26, 32, 3, 8],
-            [128, 6, 26, 32, 1, 1],
-        ];
-        for (layer, batch, layout) in layers.into_iter().flat_map(|layer| {
-            let layouts = [Layout::HalfBuffer, Layout::Buffer];
-            let cases = layouts.map(|layout| [1, 64].map(|batch| (layer, batch, layout)));
-            cases.into_iter().flatten()
-        }) {
-            let [channels, out_channels, height, width, kernel, dilation] = layer;
-            let tensor = |what, channels| {
-                let shape = Shape::new(channels, height, width);
-                Tensor::in_layout(&device, layout, what, shape, batch, 0).unwrap()
-            };
-            let weights = out_channels * channels * kernel * kernel;
-            let parameters = Parameters {
-                weight: (0..weights).map(|i| (i as f32).sin()).collect(),
-                bias: vec![0.5; out_channels],
-            };
-            let conv = Conv2d {
-                label: "layer",
-                input: &tensor("input", channels),
-                output: &tensor("output", out_channels),
-                parameters: &parameters,
-                kernel,
-                dilation,
-                activation: Activation::Relu,
-            };
-            println!("{}", describe(&conv));
-            let mut candidates = Conv2dKernel::ALL.to_vec();
-            candidates.retain(|kernel| kernel.runs_on(&device) && kernel.serves(&conv));
-            let deadline = Instant::now() + Duration::from_secs(60);
-            let (contestants, _) = race(&device, &conv, &candidates, deadline).unwrap();
-            for Contestant { kernel, time, .. } in contestants {
-                println!("  {kernel}: {:.1} us", time.as_secs_f64() * 1e6);
-            }
-        }
     }
 }

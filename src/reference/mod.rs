@@ -4,6 +4,7 @@
 //! Activations are `[channel, row, column]`, as PyTorch has them, for one image.
 
 mod back_project;
+mod cascade;
 mod concat;
 mod conv2d;
 mod coverage;
@@ -19,6 +20,7 @@ mod upsample2d;
 mod zoom;
 
 pub use back_project::back_project;
+pub use cascade::{joint_input, joints};
 pub use concat::concat;
 pub use conv2d::conv2d;
 pub use coverage::coverage;
@@ -31,7 +33,7 @@ pub use sigmoid::sigmoid;
 pub use soft_argmax2d::soft_argmax2d;
 pub use unrectify::unrectify;
 pub use upsample2d::upsample2d;
-pub use zoom::{Gaze, joint_input, zoom, zoom_joints, zoom_overlay};
+pub use zoom::{Gaze, zoom, zoom_joints, zoom_overlay};
 
 use crate::network::{Activation, Shape};
 

@@ -1,6 +1,6 @@
 use super::{Tensor, overlay};
 use crate::camera::Intrinsics;
-use crate::network::{Description, Overlay, Shape, Zoom};
+use crate::network::{Overlay, Shape, Zoom};
 
 /// The camera that the joint network looks through: where the canonical camera is, turned to the robot, zoomed in on
 /// it.
@@ -132,20 +132,4 @@ pub fn zoom_joints(seen: &[f32], gaze: &Gaze) -> Vec<f32> {
         .iter()
         .flat_map(|&[x, y, z]| gaze.turned_back([x, y, z * gaze.zoom]))
         .collect()
-}
-
-/// The joint network's input, and where it looks from unless that is the canonical camera: the overlay of `image` and
-/// `mask` that `description` asks for.
-pub fn joint_input(
-    image: &Tensor,
-    mask: &Tensor,
-    description: &Description,
-) -> (Tensor, Option<Gaze>) {
-    let rule = description.overlay;
-    let Some(rules) = description.zoom else {
-        return (overlay(image, mask, rule), None);
-    };
-    let (camera, threshold) = (&description.camera, description.presence.mask_threshold);
-    let gaze = zoom(mask, threshold, camera, rules);
-    (zoom_overlay(image, mask, rule, camera, &gaze), Some(gaze))
 }

@@ -3,7 +3,6 @@ use image::{Rgba, RgbaImage, imageops};
 use super::comparison::Comparison;
 use super::stages::numbers;
 use crate::camera::{Camera, Distortion, Intrinsics, Rectification};
-use crate::cascade::reference_joints;
 use crate::gpu::{Device, Frame, GpuError, Plan, Precision};
 use crate::network::Model;
 use crate::reference;
@@ -73,7 +72,7 @@ fn expected(model: &Model, image: &reference::Tensor, mask: &[f32]) -> Option<Fr
     let mask = reference::Tensor::new(expected.shape(), mask.to_vec())?;
     Some(Frame {
         coverage: reference::coverage(&mask, presence.mask_threshold, presence.sure_threshold),
-        joints: reference_joints(model, image, &mask).ok()?,
+        joints: reference::joints(model, image, &mask)?,
         mask: expected.data().to_vec(),
     })
 }

@@ -31,11 +31,11 @@ def masks_of(network, images, bf16=False):
         return network(images.contiguous(memory_format=torch.channels_last)).float()
 
 
-def estimate_masks(network, samples, numbers, device, bf16=False):
+def estimate_masks(network, samples, numbers, device):
     """The mask network's answer for each sample as {number: uint8 [H, W]}, 255 for certain."""
     answers = {}
     for batch in _batches(numbers):
-        estimate = masks_of(network, samples.pixels(batch)[0].to(device), bf16)
+        estimate = masks_of(network, samples.pixels(batch)[0].to(device))
         for number, mask in zip(batch, estimate, strict=True):
             answers[int(number)] = (mask[0] * 255).round().byte().cpu().numpy()
     return answers

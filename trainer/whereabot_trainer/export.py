@@ -38,7 +38,7 @@ def export_runs(args):
     """Folds calibration and standardisation into the weights, measures the cascade, and writes the model file."""
     mask, mask_card = load_mask(args.mask), _mask_card(args.mask)
     joint, joint_state = load_network(args.joint)
-    rules = joint_state["card"]["overlay"], joint_state["card"]["zoom"]
+    rules = joint_state["card"]["overlay"], joint_state["card"].get("zoom")
 
     samples = data.Samples(args.validation or args.recording, args.cache)
     robots = sorted(set(samples.robots))

@@ -1,0 +1,29 @@
+use super::{Gaze, Tensor, overlay, run, zoom, zoom_joints, zoom_overlay};
+use crate::network::{Description, Model};
+
+/// The joint network's input, and where it looks from unless that is the canonical camera: the overlay of `image` and
+/// `mask` that `description` asks for.
+pub fn joint_input(
+    image: &Tensor,
+    mask: &Tensor,
+    description: &Description,
+) -> (Tensor, Option<Gaze>) {
+    let rule = description.overlay;
+    let Some(rules) = description.zoom else {
+        return (overlay(image, mask, rule), None);
+    };
+    let (camera, threshold) = (&description.camera, description.presence.mask_threshold);
+    let gaze = zoom(mask, threshold, camera, rules);
+    (zoom_overlay(image, mask, rule, camera, &gaze), Some(gaze))
+}
+
+/// Where `model` puts the joints of the robot that `mask` shows in `image`: `x, y, z` a joint, in the canonical camera's
+/// frame. `None` where image and mask are not what its networks take.
+pub fn joints(model: &Model, image: &Tensor, mask: &Tensor) -> Option<Vec<f32>> {
+    let (input, gaze) = joint_input(image, mask, &model.description);
+    let joints = run(&model.joint_network, &input)?;
+    Some(match gaze {
+        Some(gaze) => zoom_joints(joints.data(), &gaze),
+        None => joints.data().to_vec(),
+    })
+}
