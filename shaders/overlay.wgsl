@@ -1,9 +1,5 @@
-// The joint network's input (paper, section IV): colour times the mask's probability, or colour
-// where the probability reaches THRESHOLD and black elsewhere. The probability is the second
-// input's first lane.
-
-override SOFT: bool;
-override THRESHOLD: f32;
+// The joint network's input (paper, section IV): colour as far as the mask's probability, the second input's first lane,
+// lets it through.
 
 @compute @workgroup_size(64)
 fn main(
@@ -16,10 +12,6 @@ fn main(
     if place.plane >= OUTPUT_PLANES {
         return;
     }
-    let probability = second_at(place.plane, place.y, place.x).x;
-    var share = probability;
-    if !SOFT {
-        share = select(0.0, 1.0, probability >= THRESHOLD);
-    }
+    let share = shown(second_at(place.plane, place.y, place.x).x);
     output_set(place.plane, place.y, place.x, input_at(place.plane, place.y, place.x) * share);
 }

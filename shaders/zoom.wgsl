@@ -1,8 +1,7 @@
-// Turns the joint network's camera to what each mask covers and zooms in on it: to the mean of the pixels that reach
-// THRESHOLD, so close that SPREAD of their standard deviations are as wide or as high as the image. A workgroup an image,
+// Turns the joint network's camera to what the overlay shows of each image and zooms in on it: to the mean of the pixels,
+// each as heavy as it is shown, so close that SPREAD of their standard deviations are as wide or as high as the image. A workgroup an image,
 // which adds up every GROUPth pixel in each invocation: always in the same order.
 
-override THRESHOLD: f32;
 override SPREAD: f32;
 override LEAST: f32;
 override MOST: f32;
@@ -13,8 +12,8 @@ override PIXELS: u32 = INPUT_WIDTH * INPUT_HEIGHT;
 // [image]
 @group(0) @binding(3) var<storage, read_write> gazes: array<Gaze>;
 
-// Of a share of the pixels: number; sums of x, y and of their squares, from the image's middle.
-var<workgroup> counts: array<f32, GROUP>;
+// Of a part of the pixels: weight; weighted sums of x, y and of their squares, from the image's middle.
+var<workgroup> weights: array<f32, GROUP>;
 var<workgroup> sums: array<vec4<f32>, GROUP>;
 
 @compute @workgroup_size(GROUP)
@@ -26,36 +25,35 @@ fn main(
     let image = group.y * groups.x + group.x;
     let size = vec2(f32(INPUT_WIDTH), f32(INPUT_HEIGHT));
     let middle = 0.5 * (size - 1.0);
-    var count = 0.0;
+    var weight = 0.0;
     var sum = vec4(0.0);
     if image < BATCH {
         for (var pixel = local; pixel < PIXELS; pixel += GROUP) {
             let x = pixel % INPUT_WIDTH;
             let y = pixel / INPUT_WIDTH;
-            if input_at(image, y, x).x >= THRESHOLD {
-                let at = vec2(f32(x), f32(y)) - middle;
-                count += 1.0;
-                sum += vec4(at, at * at);
-            }
+            let share = shown(input_at(image, y, x).x);
+            let at = vec2(f32(x), f32(y)) - middle;
+            weight += share;
+            sum += share * vec4(at, at * at);
         }
     }
-    counts[local] = count;
+    weights[local] = weight;
     sums[local] = sum;
     for (var half = GROUP / 2u; half > 0u; half /= 2u) {
         workgroupBarrier();
         if local < half {
-            counts[local] += counts[local + half];
+            weights[local] += weights[local + half];
             sums[local] += sums[local + half];
         }
     }
     if local > 0u || image >= BATCH {
         return;
     }
-    if counts[0] == 0.0 {
+    if weights[0] < 1e-6 {
         gazes[image] = Gaze(vec4(1.0, 0.0, 0.0, 1.0), vec4(0.0, 1.0, 0.0, 0.0), vec4(0.0, 0.0, 1.0, 0.0));
         return;
     }
-    let means = sums[0] / counts[0];
+    let means = sums[0] / weights[0];
     let deviation = sqrt(max(means.zw - means.xy * means.xy, vec2(0.0)));
     let share = SPREAD * deviation / size;
     let zoom = clamp(1.0 / max(max(share.x, share.y), 1e-6), LEAST, MOST);

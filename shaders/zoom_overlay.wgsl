@@ -1,9 +1,6 @@
-// The joint network's input as its zoomed camera sees it: colour times the mask's probability, or colour where the
-// probability reaches THRESHOLD and black elsewhere; image and mask are sampled bilinearly, black beyond their borders. The
-// mask is the second input, its probability the first lane.
-
-override SOFT: bool;
-override THRESHOLD: f32;
+// The joint network's input as its zoomed camera sees it: colour as far as the mask's probability lets it through; image
+// and mask are sampled bilinearly, black beyond their borders. The mask is the second input, its probability the first
+// lane.
 
 // [image]
 @group(0) @binding(3) var<storage, read> gazes: array<Gaze>;
@@ -43,11 +40,7 @@ fn main(
             + second_at(place.plane, low.y, high.x).x * weights.y
             + second_at(place.plane, high.y, low.x).x * weights.z
             + second_at(place.plane, high.y, high.x).x * weights.w;
-        var share = probability;
-        if !SOFT {
-            share = select(0.0, 1.0, probability >= THRESHOLD);
-        }
-        value = colour * share;
+        value = colour * shown(probability);
     }
     output_set(place.plane, place.y, place.x, value);
 }

@@ -44,11 +44,14 @@ proptest! {
     fn the_kernel_agrees_with_the_reference(
         (height, width) in (1_usize..40, 1_usize..40),
         batch in 1_usize..4,
-        soft in any::<bool>(),
+        rule in prop_oneof![
+            Just(Overlay::Multiply {}),
+            Just(Overlay::Threshold { threshold: 0.25 }),
+            Just(Overlay::Ramp { low: 0.25, high: 0.75 }),
+        ],
         seed in any::<u32>(),
     ) {
         let shape = Shape::new(3, height, width);
-        let rule = if soft { Overlay::Multiply {} } else { Overlay::Threshold { threshold: 0.25 } };
         let image = noise(batch * shape.len(), seed.into());
         let mask = noise(batch * height * width, u64::from(seed) + 1);
         let found = run(&image, &mask, shape, batch, rule);

@@ -82,7 +82,7 @@ const KERNELS: [Kernel; 28] = [
         &[("JOINTS", 6)],
     ),
     (&["max_pool2d"], &Layout::ALL, &[]),
-    (&["overlay"], &Layout::ALL, &[]),
+    (&["overlay_share", "overlay"], &Layout::ALL, &[]),
     (&["probe_arithmetic"], &[], &[]),
     (&["probe_copy"], &[], &[]),
     (&["rectify", "rectify_storage"], &Layout::ALL, &[]),
@@ -94,8 +94,12 @@ const KERNELS: [Kernel; 28] = [
     (&["soft_argmax2d"], &Layout::ALL, &[]),
     (&["unrectify"], &Layout::ALL, &[]),
     (&["upsample2d"], &Layout::ALL, &[]),
-    (&["zoom_camera", "zoom"], &Layout::ALL, &[]),
-    (&["zoom_camera", "zoom_overlay"], &Layout::ALL, &[]),
+    (&["overlay_share", "zoom_camera", "zoom"], &Layout::ALL, &[]),
+    (
+        &["overlay_share", "zoom_camera", "zoom_overlay"],
+        &Layout::ALL,
+        &[],
+    ),
     (&["zoom_camera", "zoom_joints"], &Layout::ALL, &[]),
 ];
 

@@ -15,7 +15,10 @@ const ZOOM: Zoom = Zoom {
     least: 0.5,
     most: 4.0,
 };
-const THRESHOLD: f32 = 0.5;
+const RAMP: Overlay = Overlay::Ramp {
+    low: 0.25,
+    high: 0.75,
+};
 const JOINTS: usize = 6;
 
 fn camera(shape: Shape) -> Intrinsics {
@@ -78,7 +81,7 @@ fn run(
     let steps = device.scoped(|| {
         let gazes = Gazes::new(&device, camera(shape), batch)?;
         Ok([
-            gazes.zoom(&device, &mask, ZOOM, THRESHOLD)?,
+            gazes.zoom(&device, &mask, ZOOM, rule)?,
             gazes.zoom_overlay(&device, &image, &mask, &overlay, rule)?,
             gazes.zoom_joints(&device, &seen, &joints)?,
         ])
@@ -109,7 +112,7 @@ fn expected(
     {
         let image = reference::Tensor::new(shape, image.to_vec()).unwrap();
         let mask = reference::Tensor::new(one, mask.to_vec()).unwrap();
-        let gaze = reference::zoom(&mask, THRESHOLD, &camera, ZOOM);
+        let gaze = reference::zoom(&mask, rule, &camera, ZOOM);
         overlays.extend(reference::zoom_overlay(&image, &mask, rule, &camera, &gaze).data());
         joints.extend(reference::zoom_joints(seen, &gaze));
     }
@@ -130,9 +133,8 @@ proptest! {
         let image: Vec<f32> = noise(batch * shape.len(), seed.into()).iter().map(|v| 0.1 * v).collect();
         let mask = masks(shape, batch, seed.into());
         let seen = noise(batch * 3 * JOINTS, u64::from(seed) + 2);
-        let rule = Overlay::Multiply {};
-        let (overlay, joints) = run(&image, &mask, &seen, shape, rule);
-        let (expected_overlay, expected_joints) = expected(&image, &mask, &seen, shape, rule);
+        let (overlay, joints) = run(&image, &mask, &seen, shape, RAMP);
+        let (expected_overlay, expected_joints) = expected(&image, &mask, &seen, shape, RAMP);
         prop_assert!(difference(&joints, &expected_joints).unwrap() <= 1e-4);
         prop_assert!(difference(&overlay, &expected_overlay).unwrap() <= 1e-4);
     }
@@ -169,11 +171,10 @@ fn a_pixel_more_in_the_mask_is_noticed() {
     let shape = Shape::new(3, 20, 24);
     let (image, seen) = (noise(shape.len(), 1), noise(3 * JOINTS, 3));
     let mut mask = masks(shape, 1, 1);
-    let rule = Overlay::Multiply {};
-    let (overlay, joints) = run(&image, &mask, &seen, shape, rule);
-    let far = mask.iter().rposition(|p| *p < THRESHOLD).unwrap();
+    let (overlay, joints) = run(&image, &mask, &seen, shape, RAMP);
+    let far = mask.iter().rposition(|p| *p < 0.25).unwrap();
     mask[far] = 0.9;
-    let (expected_overlay, expected_joints) = expected(&image, &mask, &seen, shape, rule);
+    let (expected_overlay, expected_joints) = expected(&image, &mask, &seen, shape, RAMP);
     assert!(difference(&joints, &expected_joints).unwrap() > 1e-3);
     assert!(difference(&overlay, &expected_overlay).unwrap() > 1e-3);
 }

@@ -139,6 +139,13 @@ class Graph:
             at = self.constant("overlay.threshold", rule["threshold"])
             self.node("GreaterOrEqual", [mask, at], "overlay.robot", self.shapes[mask])
             mask = self.node("Cast", ["overlay.robot"], "overlay.mask", self.shapes[mask], to=TensorProto.FLOAT)
+        elif rule["rule"] == "ramp":
+            slope = 1 / (rule["high"] - rule["low"])
+            factor, summand = self.constant("overlay.slope", slope), self.constant("overlay.offset", -slope * rule["low"])
+            scaled = self.node("Mul", [mask, factor], "overlay.scaled", self.shapes[mask])
+            shifted = self.node("Add", [scaled, summand], "overlay.shifted", self.shapes[mask])
+            bounds = [self.constant(f"overlay.{kind}", value) for kind, value in (("least", 0.0), ("most", 1.0))]
+            mask = self.node("Clip", [shifted, *bounds], "overlay.share", self.shapes[mask])
         return self.node("Mul", [image, mask], "overlay", self.shapes[image])
 
 

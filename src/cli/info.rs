@@ -57,6 +57,9 @@ fn card(model: &Model, file_size: usize) -> String {
         Overlay::Threshold { threshold } => {
             format!("colour where the mask is at least {threshold}")
         }
+        Overlay::Ramp { low, high } => {
+            format!("colour that fades in from a mask of {low} to one of {high}")
+        }
     };
     let zoom = match description.zoom {
         None => "none".to_owned(),

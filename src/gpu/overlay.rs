@@ -18,17 +18,20 @@ pub fn overlay(
     Step::by_texel(
         device,
         "overlay",
-        ("overlay", include_str!("../../shaders/overlay.wgsl")),
-        &rule_constants(rule),
+        (
+            "overlay",
+            concat!(
+                include_str!("../../shaders/overlay_share.wgsl"),
+                include_str!("../../shaders/overlay.wgsl")
+            ),
+        ),
+        &share_constants(rule),
         Tensors::both_to(image, mask, output),
     )
 }
 
-/// What the kernels that make an overlay know of its `rule`.
-pub(super) fn rule_constants(rule: Overlay) -> [(&'static str, f64); 2] {
-    let (soft, threshold) = match rule {
-        Overlay::Multiply {} => (1.0, 0.0),
-        Overlay::Threshold { threshold } => (0.0, f64::from(threshold)),
-    };
-    [("SOFT", soft), ("THRESHOLD", threshold)]
+/// The constants of `shaders/overlay_share.wgsl`.
+pub(super) fn share_constants(rule: Overlay) -> [(&'static str, f64); 2] {
+    let (low, high) = rule.bounds();
+    [("LOW", low.into()), ("HIGH", high.into())]
 }

@@ -118,7 +118,7 @@ impl Plan {
                     let gazes = Gazes::new(device, description.camera, batch)?;
                     let seen = joint.output();
                     let joints = Tensor::in_layout(device, layout, "joints", seen.shape, batch, 0)?;
-                    let zoom = gazes.zoom(device, output, zoom, presence.mask_threshold)?;
+                    let zoom = gazes.zoom(device, output, zoom, rule)?;
                     let overlay = gazes.zoom_overlay(device, &image, output, &masked, rule)?;
                     let step = gazes.zoom_joints(device, seen, &joints)?;
                     (vec![zoom, overlay], Some(Zoomed { step, joints }))

@@ -1,4 +1,4 @@
-use super::overlay::rule_constants;
+use super::overlay::share_constants;
 use super::step::{Step, StepDescriptor, Tensors, Work};
 use super::tensor::{Tensor, storage_buffer};
 use super::{Device, GpuError};
@@ -25,8 +25,7 @@ impl Gazes {
         Ok(Self { buffer, canonical })
     }
 
-    /// Turns them to what each `mask` `[1, height, width]` covers with at least `threshold`
-    /// (`shaders/zoom.wgsl`).
+    /// Turns them to what the overlay's `rule` shows by each `mask` `[1, height, width]` (`shaders/zoom.wgsl`).
     ///
     /// # Errors
     /// More images than a dispatch holds. Driver errors reach the caller's [`Device::scoped`].
@@ -35,14 +34,22 @@ impl Gazes {
         device: &Device,
         mask: &Tensor,
         zoom: Zoom,
-        threshold: f32,
+        rule: Overlay,
     ) -> Result<Step, GpuError> {
+        let [low, high] = share_constants(rule);
         self.step(
             device,
-            ("zoom", include_str!("../../shaders/zoom.wgsl")),
+            (
+                "zoom",
+                concat!(
+                    include_str!("../../shaders/overlay_share.wgsl"),
+                    include_str!("../../shaders/zoom.wgsl")
+                ),
+            ),
             Tensors::from(mask),
             &[
-                ("THRESHOLD", f64::from(threshold)),
+                low,
+                high,
                 ("SPREAD", f64::from(zoom.spread)),
                 ("LEAST", f64::from(zoom.least)),
                 ("MOST", f64::from(zoom.most)),
@@ -68,10 +75,13 @@ impl Gazes {
             device,
             (
                 "zoom_overlay",
-                include_str!("../../shaders/zoom_overlay.wgsl"),
+                concat!(
+                    include_str!("../../shaders/overlay_share.wgsl"),
+                    include_str!("../../shaders/zoom_overlay.wgsl")
+                ),
             ),
             Tensors::both_to(image, mask, output),
-            &rule_constants(rule),
+            &share_constants(rule),
             output.texels().div_ceil(64),
         )
     }

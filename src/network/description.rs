@@ -66,6 +66,35 @@ pub enum Overlay {
         /// In (0, 1).
         threshold: f32,
     },
+    /// Colour where the mask's probability is at least `high`, black where it is at most `low`, in proportion between: no
+    /// pixel then depends on a rounding.
+    Ramp {
+        /// In [0, 1).
+        low: f32,
+        /// In (`low`, 1].
+        high: f32,
+    },
+}
+
+impl Overlay {
+    /// The probabilities up to which nothing shows through and from which all does; the same for a threshold.
+    pub(crate) fn bounds(self) -> (f32, f32) {
+        match self {
+            Self::Multiply {} => (0.0, 1.0),
+            Self::Threshold { threshold } => (threshold, threshold),
+            Self::Ramp { low, high } => (low, high),
+        }
+    }
+
+    /// How much of the colour shows through where the mask has this `probability`: 0 to 1.
+    pub fn share(self, probability: f32) -> f32 {
+        let (low, high) = self.bounds();
+        if high > low {
+            ((probability - low) / (high - low)).clamp(0.0, 1.0)
+        } else {
+            f32::from(probability >= low)
+        }
+    }
 }
 
 /// How the joint network's camera turns to the robot: to the mean of the mask's pixels, zoomed so that so many of their
@@ -149,8 +178,16 @@ impl Description {
         };
         inside("presence.mask_threshold", self.presence.mask_threshold)?;
         inside("presence.sure_threshold", self.presence.sure_threshold)?;
-        if let Overlay::Threshold { threshold } = self.overlay {
-            inside("overlay.threshold", threshold)?;
+        match self.overlay {
+            Overlay::Multiply {} => {}
+            Overlay::Threshold { threshold } => inside("overlay.threshold", threshold)?,
+            Overlay::Ramp { low, high } => {
+                if !(low >= 0.0 && low < high && high <= 1.0) {
+                    return Err(format!(
+                        "overlay: expected low below high, both from 0 to 1, found low {low}, high {high}"
+                    ));
+                }
+            }
         }
         if let Some(zoom) = self.zoom {
             let Zoom {

@@ -12,8 +12,8 @@ pub fn joint_input(
     let Some(rules) = description.zoom else {
         return (overlay(image, mask, rule), None);
     };
-    let (camera, threshold) = (&description.camera, description.presence.mask_threshold);
-    let gaze = zoom(mask, threshold, camera, rules);
+    let camera = &description.camera;
+    let gaze = zoom(mask, rule, camera, rules);
     (zoom_overlay(image, mask, rule, camera, &gaze), Some(gaze))
 }
 

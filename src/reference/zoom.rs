@@ -26,30 +26,31 @@ impl Gaze {
     }
 }
 
-/// Turns the joint network's camera to the pixels of `mask` `[1, height, width]` that reach `threshold`: to their mean,
-/// so close that `spread` of their standard deviations are as wide or as high as the image. Where there are none, it
-/// is the canonical `camera`.
-pub fn zoom(mask: &Tensor, threshold: f32, camera: &Intrinsics, zoom: Zoom) -> Gaze {
+/// Turns the joint network's camera to the pixels that the overlay's `rule` shows by `mask` `[1, height, width]`, each as
+/// heavy as it is shown: to their mean, so close that `spread` of their standard deviations are as wide or as high as the
+/// image. Where there are none, it is the canonical `camera`.
+pub fn zoom(mask: &Tensor, rule: Overlay, camera: &Intrinsics, zoom: Zoom) -> Gaze {
     let Shape { height, width, .. } = mask.shape();
     let size = [width as f32, height as f32];
     let middle = size.map(|side| 0.5 * (side - 1.0));
-    let (mut count, mut sum, mut squares) = (0.0_f64, [0.0_f64; 2], [0.0_f64; 2]);
+    let (mut weight, mut sum, mut squares) = (0.0_f64, [0.0_f64; 2], [0.0_f64; 2]);
     for (y, row) in mask.data().chunks_exact(width).enumerate() {
-        for (x, _) in row.iter().enumerate().filter(|(_, p)| **p >= threshold) {
+        for (x, &probability) in row.iter().enumerate() {
+            let share = f64::from(rule.share(probability));
             let at = [x as f32 - middle[0], y as f32 - middle[1]].map(f64::from);
-            count += 1.0;
+            weight += share;
             for axis in 0..2 {
-                sum[axis] += at[axis];
-                squares[axis] += at[axis] * at[axis];
+                sum[axis] += share * at[axis];
+                squares[axis] += share * at[axis] * at[axis];
             }
         }
     }
-    if count == 0.0 {
+    if weight < 1e-6 {
         return Gaze::CANONICAL;
     }
-    let mean = sum.map(|v| v / count);
+    let mean = sum.map(|v| v / weight);
     let share = [0, 1].map(|axis| {
-        let variance = squares[axis] / count - mean[axis] * mean[axis];
+        let variance = squares[axis] / weight - mean[axis] * mean[axis];
         zoom.spread * (variance.max(0.0).sqrt() as f32) / size[axis]
     });
     let wanted: f32 = 1.0 / share[0].max(share[1]).max(1e-6);

@@ -221,7 +221,14 @@ pub(super) async fn overlay(
         ..shape
     };
     let batch = case.random.of(&BATCHES);
-    let rule = case.turn(&[Overlay::Multiply {}, Overlay::Threshold { threshold: 0.25 }]);
+    let rule = case.turn(&[
+        Overlay::Multiply {},
+        Overlay::Threshold { threshold: 0.25 },
+        Overlay::Ramp {
+            low: 0.25,
+            high: 0.75,
+        },
+    ]);
     let image = storable(case.random.values(batch * shape.len()), layout);
     let mask = storable(case.random.values(batch * mask_shape.len()), layout);
     // Behind the first pixel, a wrong value shows.

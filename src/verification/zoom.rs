@@ -18,7 +18,10 @@ const ZOOM: Zoom = Zoom {
     least: 0.5,
     most: 4.0,
 };
-const THRESHOLD: f32 = 0.5;
+const RULE: Overlay = Overlay::Ramp {
+    low: 0.25,
+    high: 0.75,
+};
 /// What is seen of the camera itself: its axes.
 const AXES: [f32; 9] = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
 
@@ -46,7 +49,6 @@ pub(super) async fn compare(
         _ => AXES.repeat(batch),
     };
     let camera = canonical(shape.width, shape.height);
-    let rule = Overlay::Multiply {};
 
     let tensor = |what, shape| Tensor::in_layout(device, layout, what, shape, batch, 0);
     let axes = Shape::new(AXES.len(), 1, 1);
@@ -58,9 +60,9 @@ pub(super) async fn compare(
     let (overlay, joints) = (tensor("overlay", shape)?, tensor("joints", axes)?);
     let steps = device.scoped(|| {
         let gazes = Gazes::new(device, camera, batch)?;
-        let zoom = gazes.zoom(device, &second, ZOOM, THRESHOLD)?;
+        let zoom = gazes.zoom(device, &second, ZOOM, RULE)?;
         let last = match part {
-            Part::Overlay => gazes.zoom_overlay(device, &input, &second, &overlay, rule)?,
+            Part::Overlay => gazes.zoom_overlay(device, &input, &second, &overlay, RULE)?,
             Part::Camera | Part::Joints => gazes.zoom_joints(device, &sights, &joints)?,
         };
         Ok([zoom, last])
@@ -103,9 +105,9 @@ pub(super) async fn compare(
         .filter_map(|((image, mask), seen)| {
             let image = reference::Tensor::new(shape, image.to_vec())?;
             let mask = reference::Tensor::new(one, mask.to_vec())?;
-            let gaze = reference::zoom(&mask, THRESHOLD, &camera, ZOOM);
+            let gaze = reference::zoom(&mask, RULE, &camera, ZOOM);
             Some(match part {
-                Part::Overlay => reference::zoom_overlay(&image, &mask, rule, &camera, &gaze)
+                Part::Overlay => reference::zoom_overlay(&image, &mask, RULE, &camera, &gaze)
                     .data()
                     .to_vec(),
                 Part::Camera | Part::Joints => reference::zoom_joints(seen, &gaze),

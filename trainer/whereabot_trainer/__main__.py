@@ -5,6 +5,7 @@ import argparse
 import torch
 
 from . import export, golden, pipeline, train
+from .networks import OVERLAYS
 
 
 def _training_flags(parser, *, minutes, batch, learning_rate, momentum, dilations):
@@ -115,8 +116,9 @@ def main(argv=None):
     command.add_argument("--heat-weight", type=float, default=0.02, metavar="W",
                          help="weight of the heat maps' own loss, context family alone (%(default)s)")
     command.add_argument("--pool", type=int, default=4, metavar="P", help="size of both max-pools (%(default)s)")
-    command.add_argument("--overlay", choices=("threshold", "multiply"), default="threshold",
-                         help="colour where the mask is at least 0.5, or colour times mask (%(default)s)")
+    command.add_argument("--overlay", choices=tuple(OVERLAYS),
+                         help="colour where the mask is at least 0.5, colour times mask, or colour that fades in between 0.25"
+                         " and 0.75 (paper: threshold, context: ramp)")
     command.add_argument("--mask-run", metavar="RUN", help="finished run of train-mask, or a model file, whose masks"
                          " the full system is validated with")
     command.add_argument("--estimated-masks", type=float, default=0.0, metavar="SHARE",

@@ -91,7 +91,7 @@ def overlays(images, masks, rule, view, camera=CAMERA):
     rule and, unless it is None, the zoom's."""
     if view is None:
         return overlay(images, masks, rule), None
-    cameras = zoom.look_at(masks, view, camera)
+    cameras = zoom.look_at(masks, view, rule, camera)
     seen = zoom.see(torch.cat([images, masks], 1), *cameras, camera)
     return overlay(seen[:, :3], seen[:, 3:], rule), cameras
 

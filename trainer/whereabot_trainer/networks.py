@@ -265,10 +265,27 @@ def back_project(places):
     return torch.stack([slopes_x * z, slopes_y * z, z], 2).flatten(1, 2)
 
 
+# By name, as the model file has them.
+OVERLAYS = {
+    "multiply": {"rule": "multiply"},
+    "threshold": {"rule": "threshold", "threshold": 0.5},
+    "ramp": {"rule": "ramp", "low": 0.25, "high": 0.75},
+}
+
+
+def share(mask, rule):
+    """How much of the colour shows through where the mask has these probabilities."""
+    match rule["rule"]:
+        case "multiply":
+            return mask
+        case "threshold":
+            return (mask >= rule["threshold"]).to(mask.dtype)
+        case "ramp":
+            return ((mask - rule["low"]) / (rule["high"] - rule["low"])).clamp(0, 1)
+        case unknown:
+            raise ValueError(f"unknown overlay rule {unknown!r}")
+
+
 def overlay(image, mask, rule):
-    """The joint network's input: the image [N, 3, H, W] where the mask [N, 1, H, W] says robot."""
-    if rule["rule"] == "threshold":
-        mask = (mask >= rule["threshold"]).to(image.dtype)
-    elif rule["rule"] != "multiply":
-        raise ValueError(f"unknown overlay rule {rule['rule']!r}")
-    return image * mask
+    """The joint network's input: colour [N, 3, H, W] as far as the mask [N, 1, H, W] lets it through."""
+    return image * share(mask, rule)

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from . import data, evaluate, losses, zoom
 from .model import read_model
 from .networks import (
-    JOINT_INPUT, JOINTS, MASK_INPUT, Network, context_mask_layers, heatmap_joint_layers, overlay, paper_joint_layers,
+    JOINT_INPUT, JOINTS, MASK_INPUT, OVERLAYS, Network, context_mask_layers, heatmap_joint_layers, overlay, paper_joint_layers,
     paper_mask_layers)
 
 
@@ -428,7 +428,7 @@ def train_joint(args):
         chosen[part.has_robot[chosen] & (part.coverage[chosen] >= args.min_coverage)]
         for part, chosen in ((samples, numbers), (held_out, validation)))
     joints, arms = torch.from_numpy(samples.joints), torch.from_numpy(samples.arms)
-    rule = {"rule": "threshold", "threshold": 0.5} if args.overlay == "threshold" else {"rule": "multiply"}
+    rule = OVERLAYS[args.overlay or {"paper": "threshold", "context": "ramp"}[args.family]]
     if args.family == "context":
         unit, layers, view = ArmLengths(), heatmap_joint_layers(), zoom.ZOOM
     else:
@@ -464,7 +464,7 @@ def train_joint(args):
         truth, zooms = joints[batch].to(args.device), torch.ones(len(batch))
         if view or args.camera == "free":
             if view:
-                rotations, zooms = zoom.vary(*zoom.look_at(masks, view))
+                rotations, zooms = zoom.vary(*zoom.look_at(masks, view, rule))
             else:
                 rotations = zoom.turns(*(torch.deg2rad(torch.empty(len(batch)).uniform_(-most, most)) for most in (8, 8, 10)))
             seen = zoom.see(torch.cat([images, masks], 1), rotations, zooms)

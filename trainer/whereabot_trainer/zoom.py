@@ -7,23 +7,24 @@ canonical focal length, `zoom` times nearer than the arm is.
 
 import torch
 
-from .networks import CAMERA
+from .networks import CAMERA, share
 
 # The picture's side spans so many standard deviations of the mask: nineteen arms in twenty are seen whole.
 ZOOM = {"spread": 5.0, "least": 0.5, "most": 4.0}
 
 
-def look_at(masks, zoom, camera=CAMERA):
-    """(rotations [N, 3, 3], zooms [N]) of the cameras that see what `masks` [N, 1, H, W] cover: from the canonical
-    camera's frame to theirs, without a roll. Where a mask covers nothing, the canonical camera itself."""
-    inside = (masks[:, 0] >= 0.5).float()
+def look_at(masks, zoom, rule, camera=CAMERA):
+    """(rotations [N, 3, 3], zooms [N]) of the cameras that see what the overlay's `rule` lets through of `masks`
+    [N, 1, H, W]: from the canonical camera's frame to theirs, without a roll. Where it lets nothing through, the canonical
+    camera itself."""
+    inside = share(masks[:, 0], rule)
     height, width = inside.shape[1:]
     total = inside.sum((1, 2))
 
     def mean_and_deviation(counts, extent):
         places = torch.arange(extent, device=masks.device)
-        mean = (counts * places).sum(1) / total.clamp(min=1)
-        variance = (counts * (places - mean[:, None]) ** 2).sum(1) / total.clamp(min=1)
+        mean = (counts * places).sum(1) / total.clamp(min=1e-6)
+        variance = (counts * (places - mean[:, None]) ** 2).sum(1) / total.clamp(min=1e-6)
         return mean, variance.sqrt()
 
     x, deviation_x = mean_and_deviation(inside.sum(1), width)
@@ -36,7 +37,7 @@ def look_at(masks, zoom, camera=CAMERA):
         1 - a * a / (1 + c), -a * b / (1 + c), -a,
         -a * b / (1 + c), 1 - b * b / (1 + c), -b,
         a, b, c], 1).reshape(-1, 3, 3)
-    seen = total > 0
+    seen = total > 1e-6
     canonical = torch.eye(3, device=masks.device)
     return torch.where(seen[:, None, None], rotations, canonical), torch.where(seen, zooms, 1.0)
 

@@ -31,6 +31,7 @@ struct Description {
 enum Overlay {
     Multiply,
     Threshold { threshold: f32 },
+    Ramp { low: f32, high: f32 },
 }
 
 #[derive(Deserialize)]
@@ -237,6 +238,9 @@ fn main() -> Result<()> {
             let seen = match model.overlay {
                 Overlay::Multiply => mask,
                 Overlay::Threshold { threshold } => mask.greater_equal_elem(threshold).float(),
+                Overlay::Ramp { low, high } => {
+                    mask.sub_scalar(low).div_scalar(high - low).clamp(0.0, 1.0)
+                }
             };
             let joints = model.joint_network.run("overlay", picture * seen)?;
             Ok((
