@@ -42,11 +42,21 @@ fn activate(x: vec4<f32>) -> vec4<f32> {
     return x;
 }
 
+// `dividend / divisor`, both below 2^31. A CPU rasteriser divides whole numbers lane by lane, and those of f32 all at once:
+// these are exact for what the first guess leaves.
+fn quotient(dividend: u32, divisor: u32) -> u32 {
+    let whole = i32(divisor);
+    let guess = i32(f32(i32(dividend)) / f32(whole));
+    let rest = i32(dividend) - guess * whole;
+    return u32(guess + i32(floor((f32(rest) + 0.5) / f32(whole))));
+}
+
 // The first pixel of invocation `position` of an image.
 fn first_pixel(position: u32) -> vec2<u32> {
-    let row_group = position / layer.width;
+    let row_group = quotient(position, layer.width);
     let step = layer.lattice;
-    return vec2(position % layer.width, row_group / step * (step * ROWS) + row_group % step);
+    let cycle = quotient(row_group, step);
+    return vec2(position - row_group * layer.width, cycle * (step * (ROWS - 1u)) + row_group);
 }
 
 // Of a tap from its pixel. Where the margin ends before the tap, all beyond is zero.

@@ -11,9 +11,11 @@ struct Taps {
 fn convolve(workgroup: u32, local: u32, lane: u32) {
     let pairs = (layer.out_blocks + 1u) / 2u;
     let batch = layer.batch;
-    let pair = workgroup % pairs;
-    let image = workgroup / pairs % batch;
-    let position = workgroup / (pairs * batch) * 64u + local;
+    let pixels = quotient(workgroup, pairs);
+    let pair = workgroup - pixels * pairs;
+    let part = quotient(pixels, batch);
+    let image = pixels - part * batch;
+    let position = part * 64u + local;
     let pixel = first_pixel(position);
     let centre = vec2<i32>(pixel + layer.in_margin);
 
@@ -41,8 +43,11 @@ fn convolve(workgroup: u32, local: u32, lane: u32) {
             }
             for (var ky = 0u; ky < KERNEL; ky++) {
                 let taps = read_taps((kx * KERNEL + ky) * 8u, block, pair, lane);
+                // One after the other: the weights of both at once would not fit a CPU's registers.
                 for (var row = 0u; row < ROWS; row++) {
                     low[row] += taps.low * values[row + ky];
+                }
+                for (var row = 0u; row < ROWS; row++) {
                     high[row] += taps.high * values[row + ky];
                 }
             }
