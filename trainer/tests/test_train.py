@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from whereabot_trainer import data, evaluate, golden, pipeline
+from whereabot_trainer import data, evaluate, export, golden, pipeline
 from whereabot_trainer.__main__ import main
 from whereabot_trainer.export import SURE_THRESHOLDS, choose_presence
 from whereabot_trainer.model import read_model
@@ -162,6 +162,20 @@ def test_joints_are_trained_on_beside_a_model_file_s_mask_network(train, recordi
     for key in ("mask_training", "calibration"):
         assert again["card"][key] == description["card"][key]
     assert again["presence"] == description["presence"]
+
+
+def test_several_runs_are_exported_as_the_mean_of_their_weights(train, recording, tmp_path):
+    steps = ["--iterations", "2", "--validation-samples", "4", "--family", "context"]
+    runs = [train("train-joint", "first", *steps)]
+    runs.append(train("train-joint", "second", *steps, "--init-from", str(runs[0])))
+    tensors = [load_network(run)[0].state_dict() for run in runs]
+    mean = export._mean_of(list(map(str, runs)))[0].state_dict()
+    for key, tensor in mean.items():
+        assert torch.allclose(tensor, (tensors[0][key] + tensors[1][key]) / 2)
+    assert not torch.allclose(mean["conv1.weight"], tensors[1]["conv1.weight"])
+    other = train("train-joint", "other", *steps[:4], "--family", "paper", "--pool", "4")
+    with pytest.raises(SystemExit, match="one network"):
+        export._mean_of([str(runs[0]), str(other)])
 
 
 @pytest.mark.parametrize("layers", [paper_mask_layers(), context_mask_layers()])

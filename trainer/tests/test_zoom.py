@@ -1,7 +1,7 @@
 import torch
 
 from whereabot_trainer import zoom
-from whereabot_trainer.networks import CAMERA, INPUT_HEIGHT, INPUT_WIDTH
+from whereabot_trainer.networks import CAMERA, INPUT_HEIGHT, INPUT_WIDTH, OVERLAYS, overlay
 
 
 def _centroid(picture):
@@ -43,7 +43,7 @@ def test_the_camera_looks_at_the_robot_at_a_size_of_its_own():
     masks = torch.zeros(3, 1, INPUT_HEIGHT, INPUT_WIDTH)
     masks[0, :, 40:80, 115:195] = 1
     masks[1, :, 90:110, 30:50] = 1
-    rotations, zooms = zoom.look_at(masks, zoom.ZOOM)
+    rotations, zooms = zoom.look_at(masks, zoom.ZOOM, OVERLAYS["ramp"])
     seen = zoom.see(masks, rotations, zooms)[:, 0]
     for picture in seen[:2]:
         x, y = _centroid(picture)
@@ -56,6 +56,18 @@ def test_the_camera_looks_at_the_robot_at_a_size_of_its_own():
     assert abs(share - 12**0.5 / zoom.ZOOM["spread"]) < 0.06, share
     # Nothing to look at: the camera as it is.
     assert torch.equal(rotations[2], torch.eye(3)) and zooms[2] == 1
+
+
+def test_what_is_half_shown_weighs_half():
+    masks = torch.zeros(3, 1, INPUT_HEIGHT, INPUT_WIDTH)
+    masks[:, :, 100, 50] = 1
+    masks[:, 0, 100, 150] = torch.tensor([0.5, 0.55, 0.0])
+    rays = zoom.look_at(masks, zoom.ZOOM, OVERLAYS["ramp"])[0][:, 2]
+    columns = CAMERA["fx"] * rays[:, 0] / rays[:, 2] + CAMERA["cx"]
+    assert torch.allclose(columns, torch.tensor([50 + 100 / 3, 50 + 300 / 7, 50]), atol=1e-2)
+    assert not torch.allclose(columns[0], columns[1], atol=1)
+    shown = overlay(torch.ones(3, 3, INPUT_HEIGHT, INPUT_WIDTH), masks, OVERLAYS["ramp"])[:, :, 100, 150]
+    assert torch.allclose(shown[:, 0], torch.tensor([0.5, 0.75, 0.0]))
 
 
 def test_varied_cameras_still_look_there():

@@ -117,8 +117,8 @@ def main(argv=None):
                          help="weight of the heat maps' own loss, context family alone (%(default)s)")
     command.add_argument("--pool", type=int, default=4, metavar="P", help="size of both max-pools (%(default)s)")
     command.add_argument("--overlay", choices=tuple(OVERLAYS),
-                         help="colour where the mask is at least 0.5, colour times mask, or colour that fades in between 0.25"
-                         " and 0.75 (paper: threshold, context: ramp)")
+                         help="colour where the mask is at least 0.5, colour times mask, or colour that fades in between 0.4"
+                         " and 0.6 (paper: threshold, context: ramp)")
     command.add_argument("--mask-run", metavar="RUN", help="finished run of train-mask, or a model file, whose masks"
                          " the full system is validated with")
     command.add_argument("--estimated-masks", type=float, default=0.0, metavar="SHARE",
@@ -131,7 +131,8 @@ def main(argv=None):
 
     command = commands.add_parser("export", help="write both networks as a model file")
     command.add_argument("--mask", required=True, metavar="RUN", help="run of train-mask, or a model file whose mask network stays")
-    command.add_argument("--joint", required=True, metavar="RUN", help="run of train-joint")
+    command.add_argument("--joint", required=True, nargs="+", metavar="RUN", help="run of train-joint; of several, one started"
+                         " from the other, the mean of their weights, and for the rest the last")
     source = command.add_mutually_exclusive_group(required=True)
     source.add_argument("--validation", nargs="+", metavar="DIR",
                         help="recordings to choose the presence threshold and measure the figures on")

@@ -34,10 +34,22 @@ def choose_presence(robots, without, passing=0.05):
     return threshold, least
 
 
+def _mean_of(runs):
+    """(the network whose weights are the mean of the `runs`', the last one's checkpoint). Runs of which one started from the
+    other lie in one valley of the loss: between them it is no higher than at its ends."""
+    networks, states = zip(*(load_network(run) for run in runs), strict=True)
+    network, others = networks[-1], [each.state_dict() for each in networks]
+    units = {json.dumps(output_unit(state["card"]).card()) for state in states}
+    if len(units) > 1 or any(state["layers"] != states[0]["layers"] for state in states):
+        raise SystemExit(f"--joint: expected runs of one network in one unit, found {' and '.join(runs)}")
+    network.load_state_dict({key: torch.stack([other[key] for other in others]).mean(0) for key in others[0]})
+    return network, states[-1]
+
+
 def export_runs(args):
     """Folds calibration and standardisation into the weights, measures the cascade, and writes the model file."""
     mask, mask_card = load_mask(args.mask), _mask_card(args.mask)
-    joint, joint_state = load_network(args.joint)
+    joint, joint_state = _mean_of(args.joint)
     rules = joint_state["card"]["overlay"], joint_state["card"].get("zoom")
 
     samples = data.Samples(args.validation or args.recording, args.cache)
@@ -103,7 +115,7 @@ def export_runs(args):
         "arm_length_m": arm,
         "mask_training": mask_card["mask_training"], "joint_training": _training(joint_state),
         "calibration": mask_card["calibration"], "figures": figures,
-        "curves": {"mask_accuracy": mask_card["curves"]["mask_accuracy"], **_curves(args.joint, JOINT_CURVES)}, "trainer": f"whereabot-trainer {__version__}, torch {torch.__version__.split('+')[0]}",
+        "curves": {"mask_accuracy": mask_card["curves"]["mask_accuracy"], **_curves(args.joint[-1], JOINT_CURVES)}, "trainer": f"whereabot-trainer {__version__}, torch {torch.__version__.split('+')[0]}",
         "licence": args.licence,
     }
     description = describe(

@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 from . import zoom
 from .evaluate import overlays
 from .model import describe, read_model, write_model
-from .networks import JOINT_INPUT, JOINTS, MASK_INPUT, OVERLAYS, Network
+from .networks import JOINT_INPUT, JOINTS, MASK_INPUT, Network
 
 WIDTH, HEIGHT = 20, 14
 CONTEXT_WIDTH, CONTEXT_HEIGHT = 24, 12
@@ -134,6 +134,7 @@ def write_golden(folder, seed=1):
     torch.use_deterministic_algorithms(True)
     torch.set_num_threads(1)
     multiply, threshold = {"rule": "multiply"}, {"rule": "threshold", "threshold": 0.5}
+    ramp = {"rule": "ramp", "low": 0.25, "high": 0.75}
     paper = (MASK_LAYERS, JOINT_LAYERS, WIDTH, HEIGHT)
     context = (CONTEXT_LAYERS, JOINT_LAYERS, CONTEXT_WIDTH, CONTEXT_HEIGHT)
     heatmap = (MASK_LAYERS, HEATMAP_LAYERS, WIDTH, HEIGHT)
@@ -142,7 +143,7 @@ def write_golden(folder, seed=1):
     for name, family, (mask_layers, joint_layers, width, height), rule, view, dtype in (
         ("tiny", "paper", paper, multiply, None, "f32"), ("threshold", "paper", paper, threshold, None, "f32"),
         ("tiny_f16", "paper", paper, multiply, None, "f16"), ("context", "context", context, multiply, None, "f32"),
-        ("heatmap", "context", heatmap, multiply, None, "f32"), ("zoom", "context", heatmap, OVERLAYS["ramp"], view, "f32"),
+        ("heatmap", "context", heatmap, multiply, None, "f32"), ("zoom", "context", heatmap, ramp, view, "f32"),
     ):
         image = torch.rand((3, height, width), generator=torch.Generator().manual_seed(seed))
         mask, joint = _networks(seed, image, mask_layers, joint_layers)

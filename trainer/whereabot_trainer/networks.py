@@ -269,7 +269,7 @@ def back_project(places):
 OVERLAYS = {
     "multiply": {"rule": "multiply"},
     "threshold": {"rule": "threshold", "threshold": 0.5},
-    "ramp": {"rule": "ramp", "low": 0.25, "high": 0.75},
+    "ramp": {"rule": "ramp", "low": 0.4, "high": 0.6},
 }
 
 
