@@ -84,19 +84,18 @@ fn gpu_and_reference_agree_on_photos() {
     }
 }
 
-/// Which pixels the joint network is shown behind a mask.
-fn shown(model: &Model, probability: &[f32]) -> Vec<bool> {
+/// How much of each pixel the joint network is shown behind a mask.
+fn shown(model: &Model, probability: &[f32]) -> Vec<f32> {
     let one = model.mask_network.output();
     let mask = reference::Tensor::new(one, probability.to_vec()).unwrap();
     let white = reference::Tensor::full(one, 1.0);
     let (seen, _) = reference::joint_input(&white, &mask, &model.description);
-    seen.data().iter().map(|v| *v > 0.0).collect()
+    seen.data().to_vec()
 }
 
 #[test]
 fn halves_say_the_same() {
-    // A pixel that crosses the overlay's threshold is in or out, and moves joints by up to three millimetres;
-    // where none does, they stay within a tenth of one.
+    // Joints move with what the overlay lets through: by less than half a millimetre for a whole pixel more or less.
     for (name, images) in ROBOTS {
         let model = model(name);
         let [mut full, mut half] = [Precision::F32, Precision::F16]
@@ -121,12 +120,12 @@ fn halves_say_the_same() {
             let overlap = iou(&full.1, &half.1);
             assert!(overlap >= 0.99, "{name}, {image}: IoU {overlap}");
             let metres = difference(&full.2, &half.2).unwrap();
-            let crossed = full.3.iter().zip(&half.3).filter(|(a, b)| a != b).count();
+            let moved: f32 = full.3.iter().zip(&half.3).map(|(a, b)| (a - b).abs()).sum();
             println!(
-                "{name}, {image}: IoU {overlap:.4}, {crossed} pixels crossed, joints differ by {metres} m"
+                "{name}, {image}: IoU {overlap:.4}, {moved:.2} pixels more or less, joints differ by {metres} m"
             );
             assert!(
-                metres <= 1e-4 + 3e-3 * crossed as f32,
+                metres <= 1e-4 + 5e-4 * moved,
                 "{name}, {image}: joints differ by {metres} m"
             );
             // Negative control: another picture's answer.
