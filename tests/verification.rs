@@ -47,6 +47,7 @@ fn kernels() -> BTreeSet<String> {
         "conv2d_rows",
         "estimate_layout",
         "layout",
+        "overlay_share",
         "probe_arithmetic",
         "probe_copy",
         "rectify",
