@@ -42,8 +42,8 @@ fn activate(x: vec4<f32>) -> vec4<f32> {
     return x;
 }
 
-// `dividend / divisor`, both below 2^31. A CPU rasteriser divides whole numbers lane by lane, and those of f32 all at once:
-// these are exact for what the first guess leaves.
+// `dividend / divisor`, both below 2^31, the divisor below 2^23. A CPU rasteriser divides whole numbers lane by lane, and
+// f32 all at once: a guess that rounding may put beside the quotient, and what it leaves, which f32 holds exactly.
 fn quotient(dividend: u32, divisor: u32) -> u32 {
     let whole = i32(divisor);
     let guess = i32(f32(i32(dividend)) / f32(whole));

@@ -137,7 +137,7 @@ fn a_file_of_another_network_is_refused() {
 #[test]
 fn descriptions_that_mean_something_else_are_refused() {
     type Change = fn(&mut Value);
-    let changes: [(Change, &[&str]); 17] = [
+    let changes: [(Change, &[&str]); 19] = [
         (
             |d| d["version"] = json!(2),
             &["version: expected 1, found 2"],
@@ -172,6 +172,14 @@ fn descriptions_that_mean_something_else_are_refused() {
             &["conv1"],
         ),
         (|d| d["mask_network"]["layers"] = json!([]), &["layers"]),
+        (
+            |d| d["overlay"] = json!({"rule": "ramp", "low": 0.6, "high": 0.6}),
+            &["overlay", "low below high", "low 0.6"],
+        ),
+        (
+            |d| d["overlay"] = json!({"rule": "ramp", "low": 0.4, "high": 1.5}),
+            &["overlay", "0 to 1", "high 1.5"],
+        ),
         (
             |d| d["zoom"] = json!({"spread": 0, "least": 0.5, "most": 4}),
             &["zoom", "0.01", "spread 0"],

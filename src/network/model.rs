@@ -139,7 +139,7 @@ impl Model {
                 found: "a tensor that none uses".into(),
             }));
         }
-        let expect = |what: &str, expected: Shape, found: Shape| {
+        let same_shape = |what: &str, expected: Shape, found: Shape| {
             if expected == found {
                 Ok(())
             } else {
@@ -149,9 +149,9 @@ impl Model {
             }
         };
         let mask_shape = Shape::new(1, image.height, image.width);
-        expect("mask_network", mask_shape, mask_network.output())?;
+        same_shape("mask_network", mask_shape, mask_network.output())?;
         let joint_shape = Shape::new(3 * description.joints.len(), 1, 1);
-        expect("joint_network", joint_shape, joint_network.output())?;
+        same_shape("joint_network", joint_shape, joint_network.output())?;
 
         Ok(Self {
             description,
