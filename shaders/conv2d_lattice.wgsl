@@ -22,6 +22,8 @@ struct Layer {
     row_groups: u32,
     // 0 none, 1 ReLU, 2 sigmoid
     activation: u32,
+    // Zero, which the driver does not know.
+    first_lane: u32,
 }
 
 // A layer of a texture is `block * batch + image`.

@@ -1,24 +1,32 @@
-// A convolution between textures, behind `conv2d_lattice`: eight output channels an invocation, two
-// blocks of four. What stands behind this gives the entry point and reads the weights: a texture layer
-// a pair of blocks, a row an input block, and in it two matrices for each row of each kernel column.
+// Sums of a convolution between textures, behind `conv2d_lattice`: eight output channels an invocation,
+// two blocks of four. `conv2d_pixels` or `conv2d_pooled` says which pixels, and stores them; what stands
+// behind that gives the entry point and reads the weights: a texture layer a pair of blocks, a row an
+// input block, and in it eight texels for each row of each kernel column: from four input channels to the
+// first block, and to the second.
 
-// From four input channels to four of the first and four of the second block.
-struct Taps {
-    low: mat4x4<f32>,
-    high: mat4x4<f32>,
+// Of ROWS pixels, before the activation.
+struct Sums {
+    low: array<vec4<f32>, ROWS>,
+    high: array<vec4<f32>, ROWS>,
 }
 
-fn convolve(workgroup: u32, local: u32, lane: u32) {
-    let pairs = (layer.out_blocks + 1u) / 2u;
-    let batch = layer.batch;
-    let pixels = quotient(workgroup, pairs);
-    let pair = workgroup - pixels * pairs;
-    let part = quotient(pixels, batch);
-    let image = pixels - part * batch;
-    let position = part * 64u + local;
-    let pixel = first_pixel(position);
-    let centre = vec2<i32>(pixel + layer.in_margin);
+// What a workgroup makes: a pair of blocks of an image, at 64 positions.
+struct Part {
+    pair: u32,
+    image: u32,
+    first: u32,
+}
 
+fn part_of(workgroup: u32) -> Part {
+    let pairs = (layer.out_blocks + 1u) / 2u;
+    let pixels = quotient(workgroup, pairs);
+    let part = quotient(pixels, layer.batch);
+    return Part(workgroup - pixels * pairs, pixels - part * layer.batch, part * 64u);
+}
+
+fn sums_at(pixel: vec2<u32>, image: u32, pair: u32, lane: u32) -> Sums {
+    let batch = layer.batch;
+    let centre = vec2<i32>(pixel + layer.in_margin);
     var low: array<vec4<f32>, ROWS>;
     var high: array<vec4<f32>, ROWS>;
     for (var row = 0u; row < ROWS; row++) {
@@ -37,31 +45,38 @@ fn convolve(workgroup: u32, local: u32, lane: u32) {
     for (var block = 0u; block < in_blocks; block++) {
         let plane = block * batch + image;
         for (var kx = 0u; kx < KERNEL; kx++) {
+            var texels: array<vec4<f32>, KERNEL>;
+            for (var ky = 0u; ky < KERNEL; ky++) {
+                texels[ky] = read_weights((kx * KERNEL + ky) * 8u, block, pair, lane);
+            }
             var values: array<vec4<f32>, ROWS + KERNEL - 1u>;
             for (var row = 0u; row < ROWS + KERNEL - 1u; row++) {
                 values[row] = textureLoad(input, vec2(xs[kx], ys[row]), plane);
             }
+            // All loads before, and one block after the other: the weights and sums of both at once would not fit
+            // a CPU's registers.
             for (var ky = 0u; ky < KERNEL; ky++) {
-                let taps = read_taps((kx * KERNEL + ky) * 8u, block, pair, lane);
-                // One after the other: the weights of both at once would not fit a CPU's registers.
+                let taps = spread_weights(texels[ky], (kx * KERNEL + ky) * 8u, block, pair, 0u);
                 for (var row = 0u; row < ROWS; row++) {
-                    low[row] += taps.low * values[row + ky];
+                    low[row] += taps * values[row + ky];
                 }
+            }
+            for (var ky = 0u; ky < KERNEL; ky++) {
+                let taps = spread_weights(texels[ky], (kx * KERNEL + ky) * 8u, block, pair, 1u);
                 for (var row = 0u; row < ROWS; row++) {
-                    high[row] += taps.high * values[row + ky];
+                    high[row] += taps * values[row + ky];
                 }
             }
         }
     }
-    for (var row = 0u; row < ROWS; row++) {
-        let y = pixel.y + row * layer.lattice;
-        if position < layer.row_groups * layer.width && y < layer.height {
-            let at = vec2(pixel.x, y) + layer.out_margin;
-            let plane = 2u * pair * batch + image;
-            textureStore(output, at, plane, activate(low[row]));
-            if 2u * pair + 1u < layer.out_blocks {
-                textureStore(output, at, plane + batch, activate(high[row]));
-            }
-        }
+    return Sums(low, high);
+}
+
+// Stores a pixel's four channels of each block.
+fn store(at: vec2<u32>, image: u32, pair: u32, low: vec4<f32>, high: vec4<f32>) {
+    let plane = 2u * pair * layer.batch + image;
+    textureStore(output, at + layer.out_margin, plane, activate(low));
+    if 2u * pair + 1u < layer.out_blocks {
+        textureStore(output, at + layer.out_margin, plane + layer.batch, activate(high));
     }
 }

@@ -1,22 +1,25 @@
-// `conv2d_rows` with subgroups of eight or more: an invocation reads one texel of a tap's eight, and
+// Weights for `conv2d_rows` with subgroups of eight or more: an invocation reads one texel of a tap's eight, and
 // the subgroup spreads them. All of a workgroup make the same output channels.
 
-fn read_taps(first: u32, block: u32, pair: u32, lane: u32) -> Taps {
-    let texel = textureLoad(weights, vec2(first + lane, block), pair);
-    return Taps(
-        mat4x4(
-            subgroupBroadcast(texel, 0u),
-            subgroupBroadcast(texel, 1u),
-            subgroupBroadcast(texel, 2u),
-            subgroupBroadcast(texel, 3u),
-        ),
-        mat4x4(
-            subgroupBroadcast(texel, 4u),
-            subgroupBroadcast(texel, 5u),
-            subgroupBroadcast(texel, 6u),
-            subgroupBroadcast(texel, 7u),
-        ),
-    );
+fn read_weights(first: u32, block: u32, pair: u32, lane: u32) -> vec4<f32> {
+    return textureLoad(weights, vec2(first + lane, block), pair);
+}
+
+// To block `high`, 0 or 1, of the pair.
+fn spread_weights(texel: vec4<f32>, first: u32, block: u32, pair: u32, high: u32) -> mat4x4<f32> {
+    var taps: mat4x4<f32>;
+    for (var i = 0u; i < 4u; i++) {
+        // From an invocation that the driver does not know beforehand, it is one instruction of lavapipe's where a
+        // subgroup is a register of eight values, else a loop. From one that it knows, it is two everywhere.
+        if SUBGROUP == 8u {
+            taps[i] = subgroupShuffle(texel, layer.first_lane + 4u * high + i);
+        } else if high == 0u {
+            taps[i] = subgroupBroadcast(texel, i);
+        } else {
+            taps[i] = subgroupBroadcast(texel, 4u + i);
+        }
+    }
+    return taps;
 }
 
 @compute @workgroup_size(64)

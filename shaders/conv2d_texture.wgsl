@@ -1,19 +1,17 @@
-// `conv2d_rows` where subgroups are missing or small: every invocation reads every weight.
+// Weights for `conv2d_rows` where subgroups are missing or small: every invocation reads every one.
 
-fn read_taps(first: u32, block: u32, pair: u32, lane: u32) -> Taps {
-    return Taps(
-        mat4x4(
-            textureLoad(weights, vec2(first, block), pair),
-            textureLoad(weights, vec2(first + 1u, block), pair),
-            textureLoad(weights, vec2(first + 2u, block), pair),
-            textureLoad(weights, vec2(first + 3u, block), pair),
-        ),
-        mat4x4(
-            textureLoad(weights, vec2(first + 4u, block), pair),
-            textureLoad(weights, vec2(first + 5u, block), pair),
-            textureLoad(weights, vec2(first + 6u, block), pair),
-            textureLoad(weights, vec2(first + 7u, block), pair),
-        ),
+fn read_weights(first: u32, block: u32, pair: u32, lane: u32) -> vec4<f32> {
+    return vec4(0.0);
+}
+
+// To block `high`, 0 or 1, of the pair.
+fn spread_weights(texel: vec4<f32>, first: u32, block: u32, pair: u32, high: u32) -> mat4x4<f32> {
+    let column = first + 4u * high;
+    return mat4x4(
+        textureLoad(weights, vec2(column, block), pair),
+        textureLoad(weights, vec2(column + 1u, block), pair),
+        textureLoad(weights, vec2(column + 2u, block), pair),
+        textureLoad(weights, vec2(column + 3u, block), pair),
     );
 }
 

@@ -4,12 +4,12 @@
 mod common;
 
 use common::{
-    check_in_buffers, check_layer, check_network_by, device, difference, in_halves, noise, on_gpu,
-    on_gpu_by, on_reference, one_layer, rounding,
+    check_in_buffers, check_layer, check_network_by, device, difference, in_halves, network, noise,
+    on_gpu, on_gpu_by, on_reference, one_layer, rounding,
 };
 use proptest::prelude::*;
 use whereabot::gpu::{Conv2dKernel, Layout, NetworkPlan};
-use whereabot::network::{Activation, Operation, Shape};
+use whereabot::network::{Activation, Layer, Network, Operation, Shape};
 
 fn conv2d(
     out_channels: usize,
@@ -117,6 +117,94 @@ fn each_kernel_notices_a_wrong_weight() {
             assert!(difference(&gpu, &on_reference(&other, &values)).unwrap() > wrong);
         }
     }
+}
+
+/// A convolution, the max-pool behind it, and perhaps another reader of the convolution.
+fn with_pool(
+    operation: Operation,
+    size: usize,
+    input: Shape,
+    read_by_others: bool,
+    seed: u64,
+) -> Network {
+    let layer = |name: &str, inputs: &[&str], operation| Layer {
+        name: name.into(),
+        inputs: inputs.iter().map(|&input| input.to_owned()).collect(),
+        operation,
+    };
+    let mut layers = vec![
+        layer("layer", &["input"], operation),
+        layer("pool", &["layer"], Operation::MaxPool2d { size }),
+    ];
+    if read_by_others {
+        let again = Operation::MaxPool2d { size };
+        layers.push(layer("again", &["layer"], again));
+        layers.push(layer("both", &["pool", "again"], Operation::Concat));
+    }
+    network(layers, input, seed)
+}
+
+/// How many dispatches a convolution and its max-pool are in `layout`.
+fn dispatches(network: &Network, layout: Layout, kernel: Conv2dKernel) -> usize {
+    let device = device();
+    let input = NetworkPlan::input(&device, layout, "input", network, 1).unwrap();
+    let plan = NetworkPlan::with_kernel(&device, "net", network, &input, Some(kernel)).unwrap();
+    plan.steps().len()
+}
+
+proptest! {
+    #![proptest_config(common::cases(16))]
+
+    #[test]
+    fn a_max_pool_made_with_it_agrees_with_the_reference(
+        (channels, out_channels) in (1_usize..10, 1_usize..20),
+        (height, width) in (1_usize..60, 1_usize..60),
+        batch in 1_usize..4,
+        side in prop_oneof![Just(1_usize), Just(3), Just(5)],
+        (dilation, size) in (1_usize..3, 1_usize..6),
+        activation in any_activation(),
+        read_by_others in any::<bool>(),
+        seed in any::<u32>(),
+    ) {
+        let input = Shape::new(channels, height, width);
+        let size = size.min(height).min(width);
+        let dilation = dilation.min(height.max(width).div_ceil(side / 2 + 1));
+        let operation = conv2d(out_channels, side, dilation, activation);
+        let network = with_pool(operation, size, input, read_by_others, seed.into());
+        let tolerance = rounding(channels * side * side);
+        for kernel in kernels().into_iter().filter(|kernel| channels_for(*kernel, 2) > 1) {
+            for &layout in kernel.layouts() {
+                check_network_by(layout, Some(kernel), &network, batch, seed.into(), tolerance);
+            }
+        }
+    }
+}
+
+#[test]
+fn a_max_pool_is_made_with_the_convolution_that_nothing_else_reads() {
+    let kernel = Conv2dKernel::Subgroup;
+    if !kernel.runs_on(&device()) {
+        println!("{kernel} cannot run on {}", device().info().name);
+        return;
+    }
+    let input = Shape::new(3, 21, 30);
+    let made = |dilation, size, others| {
+        let operation = conv2d(8, 3, dilation, Activation::Relu);
+        let network = with_pool(operation, size, input, others, 1);
+        dispatches(&network, Layout::Texture, kernel)
+    };
+    assert_eq!([made(1, 2, false), made(1, 4, false)], [1, 1]);
+    // Other windows, lattices of the dilation, and what others read are not.
+    assert_eq!([made(1, 3, false), made(2, 4, false)], [2, 2]);
+    assert!(made(1, 2, true) > 2);
+
+    // Negative control: its values are the convolution's.
+    let network = with_pool(conv2d(5, 3, 1, Activation::None), 2, input, false, 1);
+    let other = common::with_one_weight_changed(&network, 1e-2);
+    let values = noise(input.len(), 2);
+    let gpu = on_gpu_by(Layout::Texture, Some(kernel), &network, 1, &values);
+    assert!(difference(&gpu, &on_reference(&network, &values)).unwrap() < 1e-5);
+    assert!(difference(&gpu, &on_reference(&other, &values)).unwrap() > 1e-3);
 }
 
 #[test]

@@ -19,7 +19,7 @@ use Layout::{Buffer, HalfBuffer};
 
 /// What the library composes from the files in `shaders/`, and the constants that these want in their text:
 /// a file that nobody lists is not tested. Some have no layout: they bind their textures themselves, or draw.
-const KERNELS: [Kernel; 28] = [
+const KERNELS: [Kernel; 29] = [
     (&["back_project"], &Layout::ALL, &[]),
     (&["concat"], &Layout::ALL, &[]),
     (
@@ -44,12 +44,38 @@ const KERNELS: [Kernel; 28] = [
         ],
     ),
     (
-        &["conv2d_lattice", "conv2d_rows", "conv2d_subgroup"],
+        &[
+            "conv2d_lattice",
+            "conv2d_rows",
+            "conv2d_pixels",
+            "conv2d_subgroup",
+        ],
         &[],
-        &[("ROWS", 3), ("KERNEL", 3)],
+        &[("ROWS", 3), ("KERNEL", 3), ("SUBGROUP", 8)],
     ),
     (
-        &["conv2d_lattice", "conv2d_rows", "conv2d_texture"],
+        &[
+            "conv2d_lattice",
+            "conv2d_rows",
+            "conv2d_pooled",
+            "conv2d_subgroup",
+        ],
+        &[],
+        &[
+            ("ROWS", 4),
+            ("KERNEL", 3),
+            ("SUBGROUP", 16),
+            ("SIZE", 2),
+            ("WINDOWS", 2),
+        ],
+    ),
+    (
+        &[
+            "conv2d_lattice",
+            "conv2d_rows",
+            "conv2d_pixels",
+            "conv2d_texture",
+        ],
         &[],
         &[("ROWS", 3), ("KERNEL", 3)],
     ),

@@ -43,7 +43,9 @@ fn kernels() -> BTreeSet<String> {
     let others = [
         "conv2d_lattice",
         "conv2d_matrix",
+        "conv2d_pixels",
         "conv2d_planes",
+        "conv2d_pooled",
         "conv2d_rows",
         "estimate_layout",
         "layout",

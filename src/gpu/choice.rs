@@ -74,6 +74,11 @@ impl Conv2dKernel {
         }
     }
 
+    /// Whether it makes a max-pool behind a convolution with it.
+    pub(crate) fn pools(self) -> bool {
+        matches!(self, Self::Subgroup)
+    }
+
     /// Whether it serves a layer.
     pub(super) fn serves(self, conv: &Conv2d<'_>) -> bool {
         let fits = match self {
@@ -84,7 +89,8 @@ impl Conv2dKernel {
             Self::One => conv.kernel <= 7 && conv.output.shape.channels == 1,
             _ => true,
         };
-        fits && self.layouts().contains(&conv.input.layout())
+        let pools = conv.pool.is_none() || self.pools();
+        fits && pools && self.layouts().contains(&conv.input.layout())
     }
 
     /// Whether it is the better choice where nothing was measured. What is not known to be right on the adapter is

@@ -1,7 +1,7 @@
 use super::back_project::back_project;
 use super::choice::{Conv2dKernel, conv2d};
 use super::concat::concat;
-use super::conv2d::{Conv2d, margin};
+use super::conv2d::{Conv2d, Pool, margin};
 use super::dense::dense;
 use super::max_pool2d::max_pool2d;
 use super::sigmoid::sigmoid;
@@ -16,8 +16,8 @@ use crate::network::{Network, NetworkError, Node, Operation, Parameters, Shape, 
 #[derive(Debug)]
 pub struct NetworkPlan {
     steps: Vec<Step>,
-    /// Of every layer but the last.
-    hidden: Vec<Tensor>,
+    /// Of every layer but the last; `None` where it is nowhere.
+    hidden: Vec<Option<Tensor>>,
     output: Tensor,
 }
 
@@ -93,27 +93,42 @@ impl NetworkPlan {
         device.scoped(|| {
             let places = places(device, name, network, input)?;
             let mut steps = Vec::new();
-            let mut outputs: Vec<Tensor> = Vec::with_capacity(network.nodes().len());
-            for (index, (node, place)) in network.nodes().iter().zip(places).enumerate() {
+            let mut outputs: Vec<Option<Tensor>> = Vec::with_capacity(network.nodes().len());
+            let mut layers = network.nodes().iter().zip(places).enumerate();
+            while let Some((index, (node, place))) = layers.next() {
                 let label = format!("{name}.{}", node.layer.name);
                 let placed = place.is_some();
                 let allocate = |what: &str, shape, readers: &[Source]| {
                     let margin = margin_of(network, readers);
                     Tensor::in_layout(device, input.layout(), what, shape, input.batch, margin)
                 };
-                let output = match place {
-                    Some(place) => place,
-                    None => allocate(&label, node.output, &[Source::Layer(index)])?,
-                };
                 let sources: Vec<&Tensor> = node
                     .sources
                     .iter()
                     .map(|source| match source {
-                        Source::Layer(index) => outputs.get(*index).unwrap_or(input),
+                        Source::Layer(index) => outputs
+                            .get(*index)
+                            .and_then(Option::as_ref)
+                            .unwrap_or(input),
                         Source::Input => input,
                     })
                     .collect();
                 let source = sources.first().copied().unwrap_or(input);
+                let pool = pool_behind(device, network, index, source, kernel);
+                // What stands for the layers that are made together, and has their output.
+                let (label, last, place) = match pool.and_then(|_| layers.next()) {
+                    Some((last, (node, place))) => {
+                        (format!("{label}+{}", node.layer.name), last, place)
+                    }
+                    None => (label, index, place),
+                };
+                let output = match place {
+                    Some(place) => place,
+                    None => {
+                        let shape = network.nodes().get(last).map_or(node.output, |n| n.output);
+                        allocate(&label, shape, &[Source::Layer(last)])?
+                    }
+                };
                 match node.layer.operation {
                     Operation::Conv2d {
                         kernel: side,
@@ -130,6 +145,7 @@ impl NetworkPlan {
                             kernel: side,
                             dilation,
                             activation,
+                            pool,
                         },
                         kernel,
                     )?),
@@ -182,10 +198,14 @@ impl NetworkPlan {
                         steps.push(back_project(device, &label, source, &output)?);
                     }
                 }
-                outputs.push(output);
+                if pool.is_some() {
+                    outputs.push(None);
+                    planned();
+                }
+                outputs.push(Some(output));
                 planned();
             }
-            let output = outputs.pop().ok_or(NetworkError::Empty)?;
+            let output = outputs.pop().flatten().ok_or(NetworkError::Empty)?;
             Ok(Self {
                 steps,
                 hidden: outputs,
@@ -199,9 +219,10 @@ impl NetworkPlan {
         &self.output
     }
 
-    /// Every layer's output, in order.
-    pub fn outputs(&self) -> impl Iterator<Item = &Tensor> {
-        self.hidden.iter().chain([&self.output])
+    /// Every layer's output, in order; `None` for a convolution that is made together with the max-pool behind it.
+    pub fn outputs(&self) -> impl Iterator<Item = Option<&Tensor>> {
+        let hidden = self.hidden.iter().map(Option::as_ref);
+        hidden.chain([Some(&self.output)])
     }
 
     /// The dispatches of all layers, in order.
@@ -242,6 +263,35 @@ fn parameters(node: &Node) -> Result<&Parameters, NetworkError> {
         layer: node.layer.name.clone(),
         problem: "parameters: expected weight and bias, found none".into(),
     })
+}
+
+/// The max-pool that is made with layer `index`: that of the next layer, where the layer is a convolution of what lies
+/// in `source`, nothing else reads it, and a kernel there, or `only` that one, pools.
+fn pool_behind(
+    device: &Device,
+    network: &Network,
+    index: usize,
+    source: &Tensor,
+    only: Option<Conv2dKernel>,
+) -> Option<Pool> {
+    let (node, next) = (network.nodes().get(index)?, network.nodes().get(index + 1)?);
+    let (
+        Operation::Conv2d {
+            kernel, dilation, ..
+        },
+        Operation::MaxPool2d { size },
+    ) = (node.layer.operation, next.layer.operation)
+    else {
+        return None;
+    };
+    let readers = network.nodes().iter().flat_map(|node| &node.sources);
+    let alone = readers.filter(|s| **s == Source::Layer(index)).count() == 1;
+    let behind = next.sources.first() == Some(&Source::Layer(index));
+    // Where kernels share rows.
+    let shared = source.margin() >= Some(kernel / 2 * dilation);
+    let by = only.unwrap_or(Conv2dKernel::Subgroup);
+    let pools = source.layout() == Layout::Texture && by.pools() && by.runs_on(device);
+    Pool::new(size, dilation).filter(|_| alone && behind && shared && pools)
 }
 
 /// How far the layers that read one of `sources` reach beyond its rows and columns.

@@ -287,6 +287,7 @@ mod tests {
             kernel: 1,
             dilation: 1,
             activation: Activation::None,
+            pool: None,
         };
         tuner.choose(device, &conv, candidates).unwrap()
     }

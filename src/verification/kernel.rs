@@ -167,7 +167,7 @@ impl Kernel {
         let channels = case.random.of(&CHANNELS);
         let mut input = case.shape(channels);
         let activation = case.turn(&[Activation::None, Activation::Relu, Activation::Sigmoid]);
-        let mut before = Vec::new();
+        let (mut before, mut behind) = (Vec::new(), Vec::new());
         let mut inputs = vec!["input"];
         let (operation, rounding) = match self {
             Self::Conv2d(kernel) => {
@@ -178,10 +178,21 @@ impl Kernel {
                     Conv2dKernel::SubgroupOne | Conv2dKernel::One => 1,
                     _ => case.random.of(&CHANNELS),
                 };
+                let pooled = kernel
+                    .pools()
+                    .then(|| case.turn(&[None, Some(2), Some(4), None]));
+                let dilation = match pooled.flatten() {
+                    Some(size) => {
+                        let size = input.height.min(input.width).min(size);
+                        behind.push(layer("pool", &["layer"], Operation::MaxPool2d { size }));
+                        1
+                    }
+                    None => case.random.of(&[1, 2, 4, 7, 16]).min(most),
+                };
                 let operation = Operation::Conv2d {
                     out_channels,
                     kernel: side,
-                    dilation: case.random.of(&[1, 2, 4, 7, 16]).min(most),
+                    dilation,
                     activation,
                 };
                 let halves = match kernel {
@@ -246,6 +257,7 @@ impl Kernel {
         };
         let mut layers = before;
         layers.push(layer("layer", &inputs, operation));
+        layers.extend(behind);
         let random = &mut case.random;
         // Most sums are positive there: what a ReLU clears shows no wrong value.
         let lift = match activation {

@@ -229,6 +229,7 @@ mod tests {
             kernel: case.kernel,
             dilation: case.dilation,
             activation: Activation::Relu,
+            pool: None,
         };
         let run = |step: Step| {
             let mut encoder = device.wgpu().create_command_encoder(&Default::default());

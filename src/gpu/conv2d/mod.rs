@@ -20,7 +20,8 @@ use super::tensor::{Tensor, blocks, constant_buffer, uniform_buffer};
 use super::{Device, GpuError};
 use crate::network::{Activation, Parameters, Shape};
 
-/// A convolution to plan: from `input` to `output`, of the same height, width and layout.
+/// A convolution to plan: from `input` to `output`, of the same height, width and layout, or with the max-pool
+/// behind it to that one's output.
 pub(super) struct Conv2d<'a> {
     pub label: &'a str,
     pub input: &'a Tensor,
@@ -30,6 +31,8 @@ pub(super) struct Conv2d<'a> {
     pub kernel: usize,
     pub dilation: usize,
     pub activation: Activation,
+    /// The max-pool that is made with it.
+    pub pool: Option<Pool>,
 }
 
 impl Conv2d<'_> {
@@ -41,7 +44,7 @@ impl Conv2d<'_> {
     /// What the layer has to do, by whatever kernel.
     fn work(&self) -> Work {
         let weights = self.parameters.weight.len();
-        let Shape { height, width, .. } = self.output.shape;
+        let Shape { height, width, .. } = self.input.shape;
         Work::new(
             Tensors::from_to(self.input, self.output),
             weights + self.parameters.bias.len(),
@@ -86,6 +89,35 @@ impl Conv2d<'_> {
         padded.resize(4 * blocks, 0.0);
         padded
     }
+}
+
+/// A max-pool that `conv2d_subgroup` makes with the convolution in front of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Pool {
+    size: usize,
+}
+
+/// More rows an invocation gain less than the driver's compiler takes for them.
+const MOST_ROWS: usize = 4;
+
+impl Pool {
+    /// Of windows of `size` x `size` behind a convolution of `dilation`: `None` where an invocation's rows are not a
+    /// window's, or its columns those of no few neighbours in a subgroup.
+    pub fn new(size: usize, dilation: usize) -> Option<Self> {
+        (dilation == 1 && [2, MOST_ROWS].contains(&size)).then_some(Self { size })
+    }
+
+    /// Windows above each other that an invocation makes, of `height` in the image.
+    fn windows(self, height: usize) -> usize {
+        cheapest(MOST_ROWS / self.size, |windows| {
+            height.div_ceil(windows) * (3 + windows * self.size)
+        })
+    }
+}
+
+/// The number up to `most` of the least cost.
+fn cheapest(most: usize, cost: impl Fn(usize) -> usize) -> usize {
+    (1..=most).min_by_key(|&number| cost(number)).unwrap_or(1)
 }
 
 /// A step of a `kernel` between buffers, `source` with `shaders/conv2d_planes.wgsl` in front, which makes
@@ -133,12 +165,10 @@ pub(super) fn margin(input: Shape, kernel: usize, dilation: usize) -> usize {
 }
 
 /// How many rows an invocation of the kernels for textures makes. They are `dilation` apart: of the
-/// image's rows, few lie on one lattice. A tap's weights cost as much as three rows' arithmetic;
-/// beyond four rows, there is less to gain than the driver's compiler takes.
+/// image's rows, few lie on one lattice. A tap's weights cost as much as three rows' arithmetic.
 fn rows(conv: &Conv2d<'_>) -> usize {
     let on_lattice = conv.output.shape.height.div_ceil(conv.dilation);
-    let cost = |rows: &usize| on_lattice.div_ceil(*rows) * (3 + rows);
-    (1..=4).min_by_key(cost).unwrap_or(1)
+    cheapest(MOST_ROWS, |rows| on_lattice.div_ceil(rows) * (3 + rows))
 }
 
 /// A step of a `kernel` for textures, `source` with `shaders/conv2d_lattice.wgsl` in front: its
@@ -159,7 +189,20 @@ fn lattice(
     } = *conv;
     let Shape { height, width, .. } = output.shape;
     let lattice = conv.dilation.min(height);
-    let row_groups = height.div_ceil(lattice * rows) * lattice;
+    let subgroup = device.subgroup_size().unwrap_or(0) as usize;
+    let mut sizes = vec![
+        ("ROWS", rows),
+        ("KERNEL", conv.kernel),
+        ("SUBGROUP", subgroup),
+    ];
+    let (columns, row_groups) = match conv.pool {
+        Some(pool) => {
+            let windows = pool.windows(height);
+            sizes.extend([("SIZE", pool.size), ("WINDOWS", windows)]);
+            (width * pool.size, height.div_ceil(windows))
+        }
+        None => (width, height.div_ceil(lattice * rows) * lattice),
+    };
     let margin = |tensor: &Tensor| tensor.margin().unwrap_or(0) as u32;
     let layer = [
         output.batch as u32,
@@ -187,7 +230,7 @@ fn lattice(
             entry_point: "main",
             tensors: Tensors::default(),
             constants: &[],
-            sizes: &[("ROWS", rows), ("KERNEL", conv.kernel)],
+            sizes: &sizes,
             bindings: &[
                 (0, input.resource()),
                 (2, output.resource()),
@@ -195,7 +238,7 @@ fn lattice(
                 (4, bias.as_entire_binding()),
                 (5, layer.as_entire_binding()),
             ],
-            workgroups: (row_groups * width).div_ceil(64) * output.batch * parts,
+            workgroups: (row_groups * columns).div_ceil(64) * output.batch * parts,
             work: conv.work(),
         },
     )
