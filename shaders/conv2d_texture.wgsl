@@ -1,5 +1,6 @@
-// Weights for `conv2d_rows` where subgroups are missing or small: every invocation reads every one.
+// Weights for `conv2d_rows` where subgroups are missing or small: every invocation reads them all.
 
+// Nothing beforehand.
 fn read_weights(first: u32, block: u32, pair: u32, lane: u32) -> vec4<f32> {
     return vec4(0.0);
 }

@@ -177,6 +177,18 @@ def test_several_runs_are_exported_as_the_mean_of_their_weights(train, recording
     with pytest.raises(SystemExit, match="one network"):
         export._mean_of([str(runs[0]), str(other)])
 
+    masks = [train("train-mask", "first-mask", *steps, "--crop", "32", "24")]
+    masks.append(train("train-mask", "second-mask", *steps, "--crop", "32", "24", "--init-from", str(masks[0])))
+    out = tmp_path / "mean.safetensors"
+    main(["export", "--mask", *map(str, masks), "--joint", *map(str, runs), "--validation", str(recording), "--out", str(out),
+          "--validation-samples", "10", "--cache", str(tmp_path / "cache")])
+    mask, joint, description = read_model(out)
+    expected = export._mean_of(list(map(str, masks)))[0].state_dict()
+    for key, tensor in mask.state_dict().items():
+        shift = description["card"]["calibration"]["logit_shift"] if key == "conv11.bias" else 0.0
+        assert torch.allclose(tensor, expected[key] + shift, atol=1e-6)
+    assert torch.allclose(joint.state_dict()["conv1.weight"], mean["conv1.weight"])
+
 
 @pytest.mark.parametrize("layers", [paper_mask_layers(), context_mask_layers()])
 def test_folding_normalisation_keeps_the_function(layers):

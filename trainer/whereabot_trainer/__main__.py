@@ -130,9 +130,9 @@ def main(argv=None):
     command.set_defaults(run=_run(train.train_joint))
 
     command = commands.add_parser("export", help="write both networks as a model file")
-    command.add_argument("--mask", required=True, metavar="RUN", help="run of train-mask, or a model file whose mask network stays")
-    command.add_argument("--joint", required=True, nargs="+", metavar="RUN", help="run of train-joint; of several, one started"
-                         " from the other, the mean of their weights, and for the rest the last")
+    command.add_argument("--mask", required=True, nargs="+", metavar="RUN", help="run of train-mask, or a model file whose mask"
+                         " network stays; of several runs that started from each other, the mean of their weights")
+    command.add_argument("--joint", required=True, nargs="+", metavar="RUN", help="run of train-joint; of several likewise")
     source = command.add_mutually_exclusive_group(required=True)
     source.add_argument("--validation", nargs="+", metavar="DIR",
                         help="recordings to choose the presence threshold and measure the figures on")

@@ -36,19 +36,21 @@ def choose_presence(robots, without, passing=0.05):
 
 def _mean_of(runs):
     """(the network whose weights are the mean of the `runs`', the last one's checkpoint). Of runs of which one started from
-    the other, the mean often errs less than either (Wortsman et al., 2022)."""
+    the other, or all from the same, the mean often errs less than any (Wortsman et al., 2022)."""
     networks, states = zip(*(load_network(run) for run in runs), strict=True)
     network, others = networks[-1], [each.state_dict() for each in networks]
-    units = {json.dumps(output_unit(state["card"]).card()) for state in states}
-    if len(units) > 1 or any(state["layers"] != states[0]["layers"] for state in states):
-        raise SystemExit(f"--joint: expected runs of one network in one unit, found {' and '.join(runs)}")
+    kinds = {json.dumps([state["layers"], state["card"].get("mean"), state["card"].get("deviation")]) for state in states}
+    if len(kinds) > 1:
+        raise SystemExit(f"expected runs of one network in one unit, found {' and '.join(runs)}")
     network.load_state_dict({key: torch.stack([other[key] for other in others]).mean(0) for key in others[0]})
     return network, states[-1]
 
 
 def export_runs(args):
     """Folds calibration and standardisation into the weights, measures the cascade, and writes the model file."""
-    mask, mask_card = load_mask(args.mask), _mask_card(args.mask)
+    several = len(args.mask) > 1
+    mask = _mean_of(args.mask)[0] if several else load_mask(args.mask[0])
+    mask_card = _mask_card(args.mask[-1])
     joint, joint_state = _mean_of(args.joint)
     rules = joint_state["card"]["overlay"], joint_state["card"].get("zoom")
 
@@ -75,6 +77,10 @@ def export_runs(args):
         chosen = np.random.default_rng(args.seed).permutation(training)[: args.validation_samples]
     order = np.union1d(chosen, reported)
 
+    if several:
+        shift = evaluate.calibrate(mask, samples, chosen, args.device)
+        evaluate.shift_logits(mask, shift)
+        mask_card["calibration"]["logit_shift"] = shift
     estimated = evaluate.estimate_masks(mask, samples, order, args.device)
     seen = samples.has_robot & (samples.coverage >= joint_state["card"]["min_coverage"])
     empty = samples.coverage == 0
@@ -82,13 +88,13 @@ def export_runs(args):
     def shares(numbers, threshold):
         return [float((estimated[n] >= 255 * threshold).mean()) for n in numbers]
 
-    if Path(args.mask).is_dir():
+    if Path(args.mask[-1]).is_dir():
         sure, least = choose_presence(*(
             {threshold: shares(chosen[kind[chosen]], threshold) for threshold in SURE_THRESHOLDS}
             for kind in (seen, empty)))
     else:
         # It is the mask network's, which stays.
-        presence = read_model(args.mask)[2]["presence"]
+        presence = read_model(args.mask[-1])[2]["presence"]
         sure, least = presence["sure_threshold"], presence["min_sure"]
 
     shown = reported[seen[reported]]

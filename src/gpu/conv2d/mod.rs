@@ -101,8 +101,8 @@ pub(super) struct Pool {
 const MOST_ROWS: usize = 4;
 
 impl Pool {
-    /// Of windows of `size` x `size` behind a convolution of `dilation`: `None` where an invocation's rows are not a
-    /// window's, or its columns those of no few neighbours in a subgroup.
+    /// Of windows of `size` x `size` behind a convolution of `dilation`: `None` where a window's rows are not those of
+    /// one invocation, or its columns not those of neighbours in a subgroup of any size.
     pub fn new(size: usize, dilation: usize) -> Option<Self> {
         (dilation == 1 && [2, MOST_ROWS].contains(&size)).then_some(Self { size })
     }
