@@ -112,7 +112,7 @@ pub fn bar_charts(charts: &[BarChart]) -> Result<RgbImage, ChartError> {
 pub fn row_chart(chart: &RowChart) -> Result<RgbImage, ChartError> {
     const LINE: i32 = 22;
     const WIDTH: i32 = 900;
-    const NAMES: i32 = 130;
+    const NAMES: i32 = 148;
     const NOTES: i32 = 260;
     const OTHERS: &str = "others";
     let mut totals: Vec<(&str, f64)> = Vec::new();
