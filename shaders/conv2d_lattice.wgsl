@@ -22,7 +22,7 @@ struct Layer {
     row_groups: u32,
     // 0 none, 1 ReLU, 2 sigmoid
     activation: u32,
-    // Zero, which the driver does not know.
+    // The first of the invocations that spread weights (`conv2d_subgroup`): zero, but the driver does not know that.
     first_lane: u32,
 }
 

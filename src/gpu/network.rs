@@ -1,7 +1,7 @@
 use super::back_project::back_project;
 use super::choice::{Conv2dKernel, conv2d};
 use super::concat::concat;
-use super::conv2d::{Conv2d, Pool, margin};
+use super::conv2d::{Conv2d, margin, poolable};
 use super::dense::dense;
 use super::max_pool2d::max_pool2d;
 use super::sigmoid::sigmoid;
@@ -16,7 +16,7 @@ use crate::network::{Network, NetworkError, Node, Operation, Parameters, Shape, 
 #[derive(Debug)]
 pub struct NetworkPlan {
     steps: Vec<Step>,
-    /// Of every layer but the last; `None` where it is nowhere.
+    /// Of every layer but the last; `None` for a convolution that is made together with the max-pool behind it.
     hidden: Vec<Option<Tensor>>,
     output: Tensor,
 }
@@ -115,19 +115,17 @@ impl NetworkPlan {
                     .collect();
                 let source = sources.first().copied().unwrap_or(input);
                 let pool = pool_behind(device, network, index, source, kernel);
-                // What stands for the layers that are made together, and has their output.
-                let (label, last, place) = match pool.and_then(|_| layers.next()) {
-                    Some((last, (node, place))) => {
-                        (format!("{label}+{}", node.layer.name), last, place)
+                // Layers that are made together have the last one's output.
+                let (label, last, shape, place) = match pool.and_then(|_| layers.next()) {
+                    Some((last, (behind, place))) => {
+                        let label = format!("{label}+{}", behind.layer.name);
+                        (label, last, behind.output, place)
                     }
-                    None => (label, index, place),
+                    None => (label, index, node.output, place),
                 };
                 let output = match place {
                     Some(place) => place,
-                    None => {
-                        let shape = network.nodes().get(last).map_or(node.output, |n| n.output);
-                        allocate(&label, shape, &[Source::Layer(last)])?
-                    }
+                    None => allocate(&label, shape, &[Source::Layer(last)])?,
                 };
                 match node.layer.operation {
                     Operation::Conv2d {
@@ -265,15 +263,15 @@ fn parameters(node: &Node) -> Result<&Parameters, NetworkError> {
     })
 }
 
-/// The max-pool that is made with layer `index`: that of the next layer, where the layer is a convolution of what lies
-/// in `source`, nothing else reads it, and a kernel there, or `only` that one, pools.
+/// The side of the windows of the max-pool that is made with layer `index`: the next layer's, where the layer is a
+/// convolution of what lies in `source`, nothing else reads it, and a kernel there, or `only` that one, pools.
 fn pool_behind(
     device: &Device,
     network: &Network,
     index: usize,
     source: &Tensor,
     only: Option<Conv2dKernel>,
-) -> Option<Pool> {
+) -> Option<usize> {
     let (node, next) = (network.nodes().get(index)?, network.nodes().get(index + 1)?);
     let (
         Operation::Conv2d {
@@ -287,11 +285,11 @@ fn pool_behind(
     let readers = network.nodes().iter().flat_map(|node| &node.sources);
     let alone = readers.filter(|s| **s == Source::Layer(index)).count() == 1;
     let behind = next.sources.first() == Some(&Source::Layer(index));
-    // Where kernels share rows.
+    // An invocation makes several rows where all of their taps lie within the margin.
     let shared = source.margin() >= Some(kernel / 2 * dilation);
     let by = only.unwrap_or(Conv2dKernel::Subgroup);
     let pools = source.layout() == Layout::Texture && by.pools() && by.runs_on(device);
-    Pool::new(size, dilation).filter(|_| alone && behind && shared && pools)
+    (poolable(size, dilation) && alone && behind && shared && pools).then_some(size)
 }
 
 /// How far the layers that read one of `sources` reach beyond its rows and columns.

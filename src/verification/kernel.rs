@@ -178,16 +178,13 @@ impl Kernel {
                     Conv2dKernel::SubgroupOne | Conv2dKernel::One => 1,
                     _ => case.random.of(&CHANNELS),
                 };
-                let pooled = kernel
-                    .pools()
-                    .then(|| case.turn(&[None, Some(2), Some(4), None]));
-                let dilation = match pooled.flatten() {
-                    Some(size) => {
+                let dilation = match case.turn(&[None, Some(2), Some(4), None]) {
+                    Some(size) if kernel.pools() => {
                         let size = input.height.min(input.width).min(size);
                         behind.push(layer("pool", &["layer"], Operation::MaxPool2d { size }));
                         1
                     }
-                    None => case.random.of(&[1, 2, 4, 7, 16]).min(most),
+                    _ => case.random.of(&[1, 2, 4, 7, 16]).min(most),
                 };
                 let operation = Operation::Conv2d {
                     out_channels,

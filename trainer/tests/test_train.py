@@ -188,6 +188,11 @@ def test_several_runs_are_exported_as_the_mean_of_their_weights(train, recording
         shift = description["card"]["calibration"]["logit_shift"] if key == "conv11.bias" else 0.0
         assert torch.allclose(tensor, expected[key] + shift, atol=1e-6)
     assert torch.allclose(joint.state_dict()["conv1.weight"], mean["conv1.weight"])
+    card = description["card"]
+    assert [each["run"] for each in card["joint_training"]["mean_of"]] == [run.name for run in runs]
+    assert [each["iterations"] for each in card["mask_training"]["mean_of"]] == [2, 2]
+    with pytest.raises(SystemExit, match="folder of a run"):
+        export._mean_of([str(masks[0]), str(out)])
 
 
 @pytest.mark.parametrize("layers", [paper_mask_layers(), context_mask_layers()])

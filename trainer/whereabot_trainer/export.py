@@ -35,23 +35,28 @@ def choose_presence(robots, without, passing=0.05):
 
 
 def _mean_of(runs):
-    """(the network whose weights are the mean of the `runs`', the last one's checkpoint). Of runs of which one started from
-    the other, or all from the same, the mean often errs less than any (Wortsman et al., 2022)."""
+    """(the network whose weights are the mean of the `runs`', the last one's checkpoint, what the card says of the mean). Of
+    runs of which one started from the other, or all from the same, the mean often errs less than any (Wortsman et al., 2022)."""
+    for run in runs:
+        if not Path(run).is_dir():
+            raise SystemExit(f"expected the folder of a run, found {run}")
     networks, states = zip(*(load_network(run) for run in runs), strict=True)
     network, others = networks[-1], [each.state_dict() for each in networks]
     kinds = {json.dumps([state["layers"], state["card"].get("mean"), state["card"].get("deviation")]) for state in states}
     if len(kinds) > 1:
         raise SystemExit(f"expected runs of one network in one unit, found {' and '.join(runs)}")
     network.load_state_dict({key: torch.stack([other[key] for other in others]).mean(0) for key in others[0]})
-    return network, states[-1]
+    of = [{"run": Path(run).name, "minutes": round(state["seconds"] / 60, 1), "iterations": state["iteration"]}
+          for run, state in zip(runs, states, strict=True)]
+    return network, states[-1], {"mean_of": of} if len(runs) > 1 else {}
 
 
 def export_runs(args):
     """Folds calibration and standardisation into the weights, measures the cascade, and writes the model file."""
     several = len(args.mask) > 1
-    mask = _mean_of(args.mask)[0] if several else load_mask(args.mask[0])
+    mask, _, mask_mean = _mean_of(args.mask) if several else (load_mask(args.mask[0]), None, {})
     mask_card = _mask_card(args.mask[-1])
-    joint, joint_state = _mean_of(args.joint)
+    joint, joint_state, joint_mean = _mean_of(args.joint)
     rules = joint_state["card"]["overlay"], joint_state["card"].get("zoom")
 
     samples = data.Samples(args.validation or args.recording, args.cache)
@@ -119,7 +124,7 @@ def export_runs(args):
         "data": {"training": joint_state["card"]["training_recordings"], "validation": samples.sources,
                  "protocol": joint_state["card"]["protocol"], "note": args.note},
         "arm_length_m": arm,
-        "mask_training": mask_card["mask_training"], "joint_training": _training(joint_state),
+        "mask_training": mask_card["mask_training"] | mask_mean, "joint_training": _training(joint_state) | joint_mean,
         "calibration": mask_card["calibration"], "figures": figures,
         "curves": {"mask_accuracy": mask_card["curves"]["mask_accuracy"], **_curves(args.joint[-1], JOINT_CURVES)}, "trainer": f"whereabot-trainer {__version__}, torch {torch.__version__.split('+')[0]}",
         "licence": args.licence,

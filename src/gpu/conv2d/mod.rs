@@ -31,8 +31,8 @@ pub(super) struct Conv2d<'a> {
     pub kernel: usize,
     pub dilation: usize,
     pub activation: Activation,
-    /// The max-pool that is made with it.
-    pub pool: Option<Pool>,
+    /// The side of the windows of the max-pool that is made with it: [`poolable`].
+    pub pool: Option<usize>,
 }
 
 impl Conv2d<'_> {
@@ -91,33 +91,10 @@ impl Conv2d<'_> {
     }
 }
 
-/// A max-pool that `conv2d_subgroup` makes with the convolution in front of it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Pool {
-    size: usize,
-}
-
-/// More rows an invocation gain less than the driver's compiler takes for them.
-const MOST_ROWS: usize = 4;
-
-impl Pool {
-    /// Of windows of `size` x `size` behind a convolution of `dilation`: `None` where a window's rows are not those of
-    /// one invocation, or its columns not those of neighbours in a subgroup of any size.
-    pub fn new(size: usize, dilation: usize) -> Option<Self> {
-        (dilation == 1 && [2, MOST_ROWS].contains(&size)).then_some(Self { size })
-    }
-
-    /// Windows above each other that an invocation makes, of `height` in the image.
-    fn windows(self, height: usize) -> usize {
-        cheapest(MOST_ROWS / self.size, |windows| {
-            height.div_ceil(windows) * (3 + windows * self.size)
-        })
-    }
-}
-
-/// The number up to `most` of the least cost.
-fn cheapest(most: usize, cost: impl Fn(usize) -> usize) -> usize {
-    (1..=most).min_by_key(|&number| cost(number)).unwrap_or(1)
+/// Whether `conv2d_subgroup` makes a max-pool with windows of `size` x `size` with the convolution of `dilation` in front
+/// of it: a window's rows are one invocation's, its columns those of neighbours in a subgroup.
+pub(super) fn poolable(size: usize, dilation: usize) -> bool {
+    dilation == 1 && matches!(size, 2 | 4)
 }
 
 /// A step of a `kernel` between buffers, `source` with `shaders/conv2d_planes.wgsl` in front, which makes
@@ -164,11 +141,15 @@ pub(super) fn margin(input: Shape, kernel: usize, dilation: usize) -> usize {
     (kernel / 2 * dilation).min(input.height.max(input.width))
 }
 
-/// How many rows an invocation of the kernels for textures makes. They are `dilation` apart: of the
-/// image's rows, few lie on one lattice. A tap's weights cost as much as three rows' arithmetic.
+/// How many rows an invocation of the kernels for textures makes: of a max-pool's, whole windows. They are `dilation`
+/// apart: of the image's rows, few lie on one lattice. A tap's weights cost as much as three rows' arithmetic;
+/// beyond four rows, there is less to gain than the driver's compiler takes.
 fn rows(conv: &Conv2d<'_>) -> usize {
+    let window = conv.pool.unwrap_or(1);
     let on_lattice = conv.output.shape.height.div_ceil(conv.dilation);
-    cheapest(MOST_ROWS, |rows| on_lattice.div_ceil(rows) * (3 + rows))
+    let cost = |rows: &usize| on_lattice.div_ceil(rows / window) * (3 + rows);
+    let whole = (1..=4).filter(|rows| rows % window == 0);
+    whole.min_by_key(cost).unwrap_or(window)
 }
 
 /// A step of a `kernel` for textures, `source` with `shaders/conv2d_lattice.wgsl` in front: its
@@ -196,10 +177,10 @@ fn lattice(
         ("SUBGROUP", subgroup),
     ];
     let (columns, row_groups) = match conv.pool {
-        Some(pool) => {
-            let windows = pool.windows(height);
-            sizes.extend([("SIZE", pool.size), ("WINDOWS", windows)]);
-            (width * pool.size, height.div_ceil(windows))
+        Some(size) => {
+            let windows = rows / size;
+            sizes.extend([("SIZE", size), ("WINDOWS", windows)]);
+            (width * size, height.div_ceil(windows))
         }
         None => (width, height.div_ceil(lattice * rows) * lattice),
     };

@@ -36,11 +36,7 @@ pub fn texture(device: &Device, conv: &Conv2d<'_>, subgroups: bool) -> Result<St
     let weights = constant_texture(device, &format!("{label}: weight"), size, &weights)?;
     // Rows that share what they read need all of their taps within the margin.
     let shared = conv.input.margin() >= Some(conv.reach());
-    let rows = match conv.pool {
-        Some(pool) => pool.size * pool.windows(conv.output.shape.height),
-        None if shared => rows(conv),
-        None => 1,
-    };
+    let rows = if shared { rows(conv) } else { 1 };
     let kernel = match (subgroups, conv.pool) {
         (true, None) => ("conv2d_subgroup", source!("pixels", "subgroup")),
         (true, Some(_)) => ("conv2d_subgroup", source!("pooled", "subgroup")),
