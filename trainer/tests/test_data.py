@@ -33,6 +33,18 @@ def test_reads_a_recording_and_its_growth(recording, tmp_path):
     assert set(data.split(first)[1]) == {n for n in data.split(grown)[1] if n < 7}
 
 
+def test_another_picture_under_the_same_name_is_read(recording, tmp_path):
+    folder = tmp_path / "redrawn"
+    shutil.copytree(recording, folder)
+    cache = tmp_path / "cache"
+    before = data.Samples([folder], cache).pixels([4, 5])[0]
+    picture = folder / "image" / "000004.jpg"
+    Image.new("RGB", (512, 424), (9, 9, 9)).save(picture)
+    after = data.Samples([folder], cache).pixels([4, 5])[0]
+    assert torch.equal(after[1], before[1])
+    assert (after[0] * 255).round().eq(9).all() and not torch.equal(after[0], before[0])
+
+
 def test_one_sample_in_five_is_for_testing():
     assert np.flatnonzero(data.is_test(np.arange(40))).tolist() == [0, 1, 5, 7, 9, 16, 23, 26, 31, 35]
     assert 0.19 < data.is_test(np.arange(10000)).mean() < 0.21

@@ -61,9 +61,11 @@ def test_a_resumed_run_goes_on_as_if_never_stopped(train, monkeypatch):
 
 def test_a_run_is_not_overwritten(train):
     flags = ("--iterations", "1", "--crop", "32", "24", "--validation-samples", "1")
-    train("train-mask", "run", *flags)
+    settings = train("train-mask", "run", *flags) / "settings.json"
+    before = settings.read_text()
     with pytest.raises(SystemExit, match="--resume"):
-        train("train-mask", "run", *flags)
+        train("train-mask", "run", *flags, "--batch", "3")
+    assert settings.read_text() == before
 
 
 @pytest.mark.parametrize("family", ["paper", "context"])
@@ -262,6 +264,18 @@ def test_one_command_trains_two_robots_and_goes_on(recording, tmp_path, capsys):
     assert (tmp_path / "out" / "mask" / "log.csv").read_text() == before
     with pytest.raises(SystemExit, match="is of ur10"):
         main([*command[:2], str(recording), "--validation", str(other), *command[4:]])
+    with pytest.raises(SystemExit, match="none of ur5"):
+        main([*command, "--validation", str(other)])
+
+
+def test_a_small_validation_recording_is_chosen_on_and_reported_on_by_halves(recording, tmp_path):
+    args = SimpleNamespace(recording=[recording], validation=[recording], family="context", negatives=None, minutes=1.0, seed=7,
+                           cache="c", dtype="f16", out=str(tmp_path / "out"))
+    commands = pipeline.steps(args)
+    assert [words[0] for words in commands] == ["train-mask", "train-joint", "export"]
+    for words in commands:
+        assert words[words.index("--validation-samples") + 1] == "20"
+        assert words[words.index("--seed") + 1] == "7"
 
 
 def test_the_recordings_tell_whether_the_camera_stands_still(recording, tmp_path):

@@ -105,11 +105,21 @@ def _cached_pixels(folder, samples, cache):
         return _locked_pixels(folder, samples, cache, stem)
 
 
+def _version(path):
+    """What changes with a file's contents; [] where there is none."""
+    try:
+        known = path.stat()
+    except OSError:
+        return []
+    return [known.st_size, known.st_mtime_ns]
+
+
 def _locked_pixels(folder, samples, cache, stem):
     index = cache / f"{stem}.json"
+    files = [[_version(folder / sample[key]) for key in ("image", "mask")] for sample in samples]
 
     def digest(count):
-        return hashlib.sha256(json.dumps(samples[:count]).encode()).hexdigest()
+        return hashlib.sha256(json.dumps([samples[:count], files[:count]]).encode()).hexdigest()
 
     done = 0
     if index.exists():
@@ -200,15 +210,19 @@ def read_negatives(folders, cache):
                    if path.suffix.lower() in {".jpg", ".jpeg", ".png", ".webp"})
     if not paths:
         raise RecordingError(f"no photographs in {', '.join(map(str, folders))}")
-    names = "\n".join(map(str, paths))
-    stored = Path(cache) / f"photographs-{hashlib.sha256(names.encode()).hexdigest()[:8]}.npy"
-    if not stored.exists():
-        stored.parent.mkdir(parents=True, exist_ok=True)
-        pictures = []
-        for path in tqdm(paths, "decoding photographs", mininterval=5):
-            with Image.open(path) as file:
-                pictures.append(np.asarray(ImageOps.fit(file.convert("RGB"), (INPUT_WIDTH, INPUT_HEIGHT))))
-        np.save(stored, np.stack(pictures))
+    files = json.dumps([[str(path), _version(path)] for path in paths])
+    stored = Path(cache) / f"photographs-{hashlib.sha256(files.encode()).hexdigest()[:8]}.npy"
+    stored.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(stored.with_suffix(".lock")):
+        if not stored.exists():
+            pictures = []
+            for path in tqdm(paths, "decoding photographs", mininterval=5):
+                with Image.open(path) as file:
+                    pictures.append(np.asarray(ImageOps.fit(file.convert("RGB"), (INPUT_WIDTH, INPUT_HEIGHT))))
+            partial = stored.with_suffix(".partial")
+            with open(partial, "wb") as file:
+                np.save(file, np.stack(pictures))
+            partial.replace(stored)
     return np.load(stored, mmap_mode="r")
 
 

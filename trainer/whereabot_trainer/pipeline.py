@@ -11,6 +11,7 @@ from . import data
 
 # Shares of the time. The mask network is the larger one; what robots have in common is most of what there is to learn.
 MASK, COMMON = 0.45, 0.6
+VALIDATION_SAMPLES = 100
 
 
 def steps(args):
@@ -26,12 +27,23 @@ def steps(args):
         if robot not in by_robot:
             raise SystemExit(f"--validation: {folder} is of {robot}, of which there is no --recording")
         by_robot[robot][1].append(folder)
+    without = sorted(robot for robot, (_, held_out) in by_robot.items() if not held_out)
+    if args.validation and without:
+        # The common networks would see the fifth of theirs that is kept for testing.
+        raise SystemExit(f"--validation: expected recordings of all robots, found none of {', '.join(without)}")
     out, commands = Path(args.out), []
 
     def recordings(robots):
         words = ["--recording", *(folder for robot in robots for folder in by_robot[robot][0])]
+        return [*words, *validation(robots)]
+
+    def validation(robots):
         held_out = [folder for robot in robots for folder in by_robot[robot][1]]
-        return [*words, *(["--validation", *held_out] if held_out else [])]
+        if not held_out:
+            return []
+        # What export reports on is not what it chooses on.
+        half = sum(len(data.read_samples(folder)) for folder in held_out) // 2
+        return ["--validation", *held_out, "--validation-samples", str(max(1, min(VALIDATION_SAMPLES, half)))]
 
     def step(command, run, robots, minutes, *flags):
         resume = ["--resume"] if (out / run / "last.pt").exists() else []
@@ -63,10 +75,10 @@ def steps(args):
     for robot in robots:
         mask = "mask" if shared else f"mask-{robot}"
         of = robots if shared else [robot]
-        held_out = [folder for name in of for folder in by_robot[name][1]]
-        source = ["--validation", *held_out] if by_robot[robot][1] else ["--recording", *by_robot[robot][0]]
+        source = validation(of) or ["--recording", *by_robot[robot][0]]
         commands.append(["export", "--mask", str(out / mask), "--joint", str(out / f"joint-{robot}"), *source,
-                         "--robot", robot, "--cache", args.cache, "--out", str(out / f"{robot}.safetensors"), "--dtype", args.dtype])
+                         "--robot", robot, "--cache", args.cache, "--seed", str(args.seed),
+                         "--out", str(out / f"{robot}.safetensors"), "--dtype", args.dtype])
     return commands
 
 

@@ -124,8 +124,6 @@ def fit(args, network, numbers, draw, batch_loss, score, card):
     validation figures as a dict. `card` goes into the checkpoint. Rates decay to nearly nothing, so the last state is the one to use, and validation chooses nothing.
     """
     out = Path(args.out)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "settings.json").write_text(json.dumps(vars(args), indent=1, default=str) + "\n")
     optimizer = make_optimizer(args.optimizer, network, args.weight_decay)
     schedule = Schedule(args.learning_rate, args.momentum)
     order = Order(numbers, args.batch)
@@ -136,9 +134,11 @@ def fit(args, network, numbers, draw, batch_loss, score, card):
         network.load_state_dict(state["network"])
         optimizer.load_state_dict(state["optimizer"])
         order.state, iteration, before = state["order"], state["iteration"], state["seconds"]
-        torch.set_rng_state(state["rng"])
+        _set_rng_state(state["rng"])
     elif last.exists():
         raise SystemExit(f"{out} holds a run already: add --resume to go on with it, or choose another folder")
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "settings.json").write_text(json.dumps(vars(args), indent=1, default=str) + "\n")
 
     started, seconds, total, counted = time.monotonic(), before, 0.0, 0
     budget = args.iterations or 60 * args.minutes
@@ -172,13 +172,24 @@ def fit(args, network, numbers, draw, batch_loss, score, card):
                 partial = last.with_suffix(".partial")
                 torch.save({"layers": network.layers, "normalise": network.normalise, "network": network.state_dict(),
                             "card": card, "iteration": iteration, "seconds": seconds, "figures": figures,
-                            "optimizer": optimizer.state_dict(), "order": order.state, "rng": torch.get_rng_state()},
+                            "optimizer": optimizer.state_dict(), "order": order.state, "rng": _rng_state()},
                            partial)
                 partial.replace(last)
                 bar.set_postfix({key: figures[key] for key in list(figures)[4:]})
                 seconds = before + time.monotonic() - started
                 progress = max(progress, (iteration if args.iterations else seconds) / budget)
             bar.update(min(progress, 1) - bar.n)
+
+
+def _rng_state():
+    """Of the processor's random numbers, which order samples, and of each GPU's, which vary them there."""
+    return [torch.get_rng_state(), *torch.cuda.get_rng_state_all()]
+
+
+def _set_rng_state(states):
+    processor, *cards = states
+    torch.set_rng_state(processor)
+    torch.cuda.set_rng_state_all(cards)
 
 
 def _append_csv(path, row):
@@ -315,7 +326,8 @@ def train_mask(args):
         return losses.mask_loss(network(images), masks, w_fg, w_bg)
 
     # What is reported on is not calibrated on: with a random split, the training samples are.
-    calibration = (held_out, validation) if args.validation else (samples, numbers[: args.validation_samples])
+    some = np.sort(np.random.default_rng(args.seed).permutation(numbers)[: args.validation_samples])
+    calibration = (held_out, validation) if args.validation else (samples, some)
 
     def score():
         shift = evaluate.calibrate(network, *calibration, args.device)
@@ -433,7 +445,10 @@ def train_joint(args):
         unit, layers, view = ArmLengths(), heatmap_joint_layers(), zoom.ZOOM
     else:
         view = None
-        unit, layers = Standardised.of(samples.joints[numbers]), paper_joint_layers(args.dilations, args.pool)
+        layers = paper_joint_layers(args.dilations, args.pool)
+        # A recording may have grown since: what is resumed keeps its unit.
+        unit = (output_unit(torch.load(Path(args.out) / "last.pt", weights_only=False)["card"]) if args.resume
+                else Standardised.of(samples.joints[numbers]))
     card |= {"family": args.family, "samples": len(numbers), "camera": args.camera, "overlay": rule, "zoom": view, "min_coverage": args.min_coverage,
              "estimated_masks": args.estimated_masks, "estimated_after": args.estimated_after, **unit.card()}
     network = initialise(Network(layers, JOINT_INPUT, normalise=args.normalise))
