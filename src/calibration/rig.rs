@@ -270,11 +270,15 @@ impl Rig {
         }
         let link = self.links.get(place(to.min(from), to.max(from)))?;
         let (_, down, up) = link.found.as_ref()?;
-        let newest = self.seen.iter().flatten().map(|seen| seen.time_s);
-        let newest = newest.fold(f64::NEG_INFINITY, f64::max);
         let (last, _) = link.instants.back()?;
-        let remembered = newest - last <= 3.0 * self.options.memory_s;
+        let remembered = self.newest() - last <= 3.0 * self.options.memory_s;
         remembered.then_some(if to < from { down } else { up })
+    }
+
+    /// When any camera saw the robot last.
+    fn newest(&self) -> f64 {
+        let times = self.seen.iter().flatten().map(|seen| seen.time_s);
+        times.fold(f64::NEG_INFINITY, f64::max)
     }
 
     /// The joints at the newest instant, by all cameras that saw the robot then and whose place is known. Empty as long
@@ -286,8 +290,8 @@ impl Rig {
         let seen = self.seen.iter().zip(self.poses());
         let seen = seen.filter_map(|(seen, pose)| Some((seen.as_ref()?, pose?)));
         let seen: Vec<(&Seen, CameraPose)> = seen.collect();
-        let newest = seen.iter().map(|(seen, _)| seen.time_s);
-        let newest = newest.fold(f64::NEG_INFINITY, f64::max);
+        // What a camera of unknown place sees is newer than what others saw before.
+        let newest = self.newest();
         let now = seen
             .iter()
             .filter(|(seen, _)| newest - seen.time_s <= self.options.simultaneous_s);

@@ -1,4 +1,4 @@
-use std::time::UNIX_EPOCH;
+use std::time::{Instant, UNIX_EPOCH};
 
 use glam::DVec3;
 
@@ -28,6 +28,8 @@ pub struct Fusion<F> {
     /// Each camera's place in the rig, by its place in the configuration.
     places: Vec<Option<usize>>,
     rig: Rig,
+    /// When the first frame was taken. The wall clock may be set back, and would have the rig wait until it is where it was.
+    started: Option<Instant>,
     smoother: Option<Smoother>,
     fused: F,
 }
@@ -48,6 +50,7 @@ impl<F: FnMut(Fused) + Send> Fusion<F> {
             number,
             places: (0..most).map(place).collect(),
             rig: Rig::new(cameras.len(), options),
+            started: None,
             smoother: smoothing_s.map(Smoother::new),
             fused,
         }
@@ -71,11 +74,15 @@ impl<F: FnMut(Fused) + Send> Sink for Fusion<F> {
         let Some(&middle) = joints.get(joints.len() / 2) else {
             return;
         };
-        self.rig.observe(place, time_s, &joints, Spread::at(middle));
+        let at = observation.acquired_at;
+        let started = *self.started.get_or_insert(at);
+        let since = at.saturating_duration_since(started).as_secs_f64()
+            - started.saturating_duration_since(at).as_secs_f64();
+        self.rig.observe(place, since, &joints, Spread::at(middle));
         let mut joints = self.rig.fused();
         if let Some(smoother) = &mut self.smoother {
             let points: Vec<DVec3> = joints.iter().map(|joint| joint.xyz_m).collect();
-            for (joint, smooth) in joints.iter_mut().zip(smoother.step(time_s, &points)) {
+            for (joint, smooth) in joints.iter_mut().zip(smoother.step(since, &points)) {
                 joint.xyz_m = smooth;
             }
         }
