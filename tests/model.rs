@@ -301,6 +301,16 @@ fn huge_numbers_in_a_description_are_refused_before_anything_is_allocated() {
         d["mask_network"]["layers"][0]["dilation"] = json!(u64::MAX / 2);
     });
     assert_says(&error, &["mask.conv1", "reach"]);
+    // A file of a few bytes that asks for gigabytes: enlarged by as much as it is made smaller again.
+    let error = with_description(|d| {
+        let layers = d["mask_network"]["layers"].as_array_mut().unwrap();
+        let first = layers[0]["inputs"].clone();
+        layers[0]["inputs"] = json!(["down"]);
+        let up = json!({"name": "up", "op": "upsample2d", "inputs": first, "scale": 600});
+        let down = json!({"name": "down", "op": "max_pool2d", "inputs": ["up"], "size": 600});
+        layers.splice(0..0, [up, down]);
+    });
+    assert_says(&error, &["mask.up", "2^28 values in all layers"]);
 }
 
 #[test]

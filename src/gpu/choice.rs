@@ -127,7 +127,7 @@ impl fmt::Display for Conv2dKernel {
 }
 
 /// Plans a convolution: by `only`, if it is given, or by what the device's tuner finds to be the fastest,
-/// or else by the first kernel that suits.
+/// or else by the first kernel that suits and that it did not refuse.
 pub(super) fn conv2d(
     device: &Device,
     conv: &Conv2d<'_>,
@@ -141,7 +141,7 @@ pub(super) fn conv2d(
             Some(fastest) => Some(fastest),
             None => candidates
                 .into_iter()
-                .find(|kernel| kernel.suits(device, conv)),
+                .find(|&kernel| kernel.suits(device, conv) && !refused(device, kernel)),
         },
     };
     match chosen {
@@ -172,6 +172,17 @@ fn tuned(
 fn known(device: &Device, kernel: Conv2dKernel) -> bool {
     #[cfg(not(target_arch = "wasm32"))]
     return device.tuner().knows(kernel);
+    #[cfg(target_arch = "wasm32")]
+    {
+        let _ = (device, kernel);
+        false
+    }
+}
+
+/// Whether the device's tuner found `kernel` to fail or to answer wrongly. `conv2d_buffer` is what it holds others to.
+fn refused(device: &Device, kernel: Conv2dKernel) -> bool {
+    #[cfg(not(target_arch = "wasm32"))]
+    return kernel != Conv2dKernel::Buffer && device.tuner().refuses(kernel);
     #[cfg(target_arch = "wasm32")]
     {
         let _ = (device, kernel);

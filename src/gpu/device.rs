@@ -133,7 +133,8 @@ impl Device {
 
     /// Uses a host's device and queue, with whatever features and limits the host enabled; WebGPU's
     /// defaults are enough. The host's error handlers, and error scopes that it has open, see nothing of
-    /// it; nothing is submitted but by calls that say so.
+    /// it; nothing is submitted but by calls that say so. In a browser errors come later, and to the host's handlers
+    /// alone: after one, what was computed is no result.
     ///
     /// # Errors
     /// [`GpuError::Limit`] where the device has less than WebGPU's defaults of what every kernel needs, and
@@ -217,8 +218,9 @@ impl Device {
     }
 
     /// Lets plans find the fastest kernels for their layers by timing them, which takes `limit`, all plans
-    /// together, and at most one kernel's compilation and timing more. `memory` is what [`Device::tuning`] gave in an earlier process; what is of
-    /// another adapter, driver or version of this library, or no such thing at all, is passed over.
+    /// together, and for the last layer one kernel's compilation and a few rounds of timing more. `memory` is what
+    /// [`Device::tuning`] gave in an earlier process; what is of another adapter, driver or version of this library, or no
+    /// such thing at all, is passed over.
     #[cfg(not(target_arch = "wasm32"))]
     #[must_use]
     pub fn tuned(mut self, limit: Duration, memory: &[u8]) -> Self {
@@ -287,7 +289,7 @@ impl Device {
     /// Runs `make`, which creates resources, and gives what the driver said about it.
     ///
     /// # Errors
-    /// What `make` answers, validation failures, and too little memory.
+    /// What `make` answers, too little memory, a kernel that the driver does not compile, and validation failures.
     pub fn scoped<T>(&self, make: impl FnOnce() -> Result<T, GpuError>) -> Result<T, GpuError> {
         self.check()?;
         // A browser says what it thinks of calls later: of our own device to its handler.
@@ -296,10 +298,18 @@ impl Device {
         #[cfg(not(target_arch = "wasm32"))]
         let made = {
             let memory = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
+            let internal = self.device.push_error_scope(wgpu::ErrorFilter::Internal);
             let validation = self.device.push_error_scope(wgpu::ErrorFilter::Validation);
             let made = make();
-            let errors = [validation.pop(), memory.pop()].map(pollster::block_on);
-            if let Some(error) = errors.into_iter().flatten().next() {
+            let errors = [validation.pop(), internal.pop(), memory.pop()];
+            // What could not be made is not valid either: that is the consequence.
+            if let Some(error) = errors
+                .map(pollster::block_on)
+                .into_iter()
+                .rev()
+                .flatten()
+                .next()
+            {
                 return Err(convert(error));
             }
             made
@@ -382,11 +392,19 @@ impl Device {
     ) -> Result<T, GpuError> {
         let (mapping, callback) = Mapping::new();
         buffer.map_async(wgpu::MapMode::Read, .., callback);
-        #[cfg(not(target_arch = "wasm32"))]
-        self.wait()?;
-        mapping.finish(self).await?;
-        // A browser tells by now what it refused before: what then was mapped is no result.
-        self.check()?;
+        let done = async {
+            #[cfg(not(target_arch = "wasm32"))]
+            self.wait()?;
+            mapping.finish(self).await?;
+            // A browser tells by now what it refused before: what then was mapped is no result.
+            self.check()
+        };
+        let done = done.await;
+        if let Err(GpuError::Timeout(_)) = done {
+            // It would be mapped later, and what is written to it then be refused.
+            buffer.unmap();
+        }
+        done?;
         mapped(buffer, read)
     }
 }
@@ -409,6 +427,6 @@ fn convert(error: wgpu::Error) -> GpuError {
     match error {
         wgpu::Error::OutOfMemory { source } => GpuError::OutOfMemory(source.to_string()),
         wgpu::Error::Validation { description, .. } => GpuError::Validation(description),
-        wgpu::Error::Internal { description, .. } => GpuError::Lost(description),
+        wgpu::Error::Internal { description, .. } => GpuError::Driver(description),
     }
 }

@@ -97,6 +97,9 @@ pub enum GpuError {
     /// The driver refused a call: a defect of this library or of the driver, or a host's view of several layers.
     #[error("GPU validation failed: {0}")]
     Validation(String),
+    /// The driver failed, as where it does not compile a kernel.
+    #[error("the GPU's driver failed: {0}")]
+    Driver(String),
     /// The device is gone; open another one and build anew.
     #[error("the GPU device was lost: {0}")]
     Lost(String),

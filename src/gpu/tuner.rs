@@ -1,4 +1,4 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -22,6 +22,8 @@ struct State {
     left: Duration,
     winners: BTreeMap<String, String>,
     changed: bool,
+    /// Those that failed or answered wrongly for some layer.
+    refused: HashSet<Conv2dKernel>,
 }
 
 /// What is remembered from one process to the next.
@@ -43,6 +45,7 @@ impl Tuner {
             left: limit,
             winners: ours.map(|memory| memory.winners).unwrap_or_default(),
             changed: false,
+            refused: HashSet::new(),
         };
         Self {
             state: Mutex::new(state),
@@ -87,10 +90,12 @@ impl Tuner {
         }
         let start = Instant::now();
         let found = fastest(device, conv, candidates, start + state.left)?;
+        state.refused.extend(found.refused);
         state.left = state.left.saturating_sub(start.elapsed());
         if let Found {
             kernel: Some(fastest),
             of_all: true,
+            ..
         } = found
         {
             state.winners.insert(layer, fastest.to_string());
@@ -105,12 +110,17 @@ impl Tuner {
         self.state().winners.values().any(|winner| *winner == name)
     }
 
+    /// Whether `kernel` failed or answered wrongly on the adapter.
+    pub fn refuses(&self, kernel: Conv2dKernel) -> bool {
+        self.state().refused.contains(&kernel)
+    }
+
     fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// Of an adapter, its driver, and the kernels.
+/// Of an adapter, its driver, this library's version, the kernels, and what packs their weights.
 fn identity(info: &wgpu::AdapterInfo) -> String {
     let mut kernels = DefaultHasher::new();
     [
@@ -120,6 +130,13 @@ fn identity(info: &wgpu::AdapterInfo) -> String {
         include_str!("../../shaders/conv2d_one.wgsl"),
         include_str!("../../shaders/conv2d_matrix.wgsl"),
         include_str!("../../shaders/conv2d_cooperative.wgsl"),
+        include_str!("conv2d/mod.rs"),
+        include_str!("conv2d/buffer.rs"),
+        include_str!("conv2d/tiled.rs"),
+        include_str!("conv2d/one.rs"),
+        include_str!("conv2d/cooperative.rs"),
+        env!("CARGO_PKG_VERSION"),
+        include_str!("../../shaders/layout/geometry.wgsl"),
         include_str!("../../shaders/layout/buffer.wgsl"),
         include_str!("../../shaders/layout/half_buffer.wgsl"),
     ]
@@ -154,6 +171,8 @@ struct Found {
     kernel: Option<Conv2dKernel>,
     /// Not so where the time was over first.
     of_all: bool,
+    /// Those that failed or answered wrongly.
+    refused: Vec<Conv2dKernel>,
 }
 
 /// The fastest of those of `candidates`, in their order, that are compiled by the `deadline`.
@@ -168,7 +187,7 @@ fn fastest(
 ) -> Result<Found, GpuError> {
     conv.input.fill(device);
     let expected = answer(device, conv)?;
-    let mut contestants = Vec::new();
+    let (mut contestants, mut refused) = (Vec::new(), Vec::new());
     let mut of_all = true;
     for &kernel in candidates {
         if Instant::now() > deadline {
@@ -177,12 +196,16 @@ fn fastest(
         }
         match contestant(device, conv, kernel, &expected) {
             Ok(Some(contestant)) => contestants.push(contestant),
-            Ok(None) => log::warn!(
-                "{}: `{kernel}` is not used: its answer is wrong here",
-                conv.label
-            ),
+            Ok(None) => {
+                refused.push(kernel);
+                log::warn!(
+                    "{}: `{kernel}` is not used: its answer is wrong here",
+                    conv.label
+                );
+            }
             Err(error) => {
                 device.check()?;
+                refused.push(kernel);
                 log::warn!("{}: `{kernel}` is not used: {error}", conv.label);
             }
         }
@@ -211,6 +234,7 @@ fn fastest(
     Ok(Found {
         kernel: best.map(|best| best.kernel),
         of_all,
+        refused,
     })
 }
 
@@ -329,5 +353,7 @@ mod tests {
         let tuner = Tuner::new(Duration::from_secs(60), device.info(), b"");
         // It binds textures, and gets buffers.
         assert_eq!(choose(&device, &tuner, &[Subgroup, Buffer]), Some(Buffer));
+        // For later layers too, when there is no time left to look.
+        assert!(tuner.refuses(Subgroup) && !tuner.refuses(Buffer));
     }
 }

@@ -44,6 +44,10 @@ pub struct Network {
     nodes: Vec<Node>,
 }
 
+/// Of all layers together: a gigabyte in f32, for a file of a few bytes may ask for more than a machine has. Geometry is
+/// 32-bit in the kernels.
+const MOST_VALUES: usize = 1 << 28;
+
 impl Network {
     /// Works out shapes and takes each layer's parameters from `parameters`, which gets the layer's
     /// name and the dimensions of its weight and bias.
@@ -60,7 +64,7 @@ impl Network {
         let mut known: HashMap<String, (Source, Shape)> =
             HashMap::from([(input_name.to_owned(), (Source::Input, input))]);
         let mut nodes = Vec::with_capacity(layers.len());
-        let mut output = None;
+        let (mut output, mut total) = (None, 0);
         for (index, layer) in layers.into_iter().enumerate() {
             let wrong = |problem: String| NetworkError::Layer {
                 layer: layer.name.clone(),
@@ -80,13 +84,11 @@ impl Network {
             let result = layer.operation.output_shape(&shapes).map_err(wrong)?;
             // Every operation has at least one input, or has just been refused.
             let shape = shapes.first().copied().unwrap_or(input);
-            // Geometry is 32-bit in the kernels.
-            if result
-                .checked_len()
-                .is_none_or(|len| len > i32::MAX as usize)
-            {
+            let length = result.checked_len().filter(|&length| length < MOST_VALUES);
+            total += length.unwrap_or(MOST_VALUES);
+            if total >= MOST_VALUES {
                 return Err(wrong(format!(
-                    "output: expected fewer than 2^31 values, found shape {result}"
+                    "output: expected fewer than 2^28 values in all layers together, found shape {result}"
                 )));
             }
             let values = match layer.operation.parameter_dims(shape) {
