@@ -12,7 +12,7 @@ use crate::cascade::Locator;
 use crate::gpu::{AdapterRequest, Device, GpuError, Precision};
 use crate::network::Model;
 
-#[derive(Debug, clap::Args)]
+#[derive(Debug, Clone, clap::Args)]
 pub(super) struct EngineArgs {
     /// The adapter to run on (see `whereabot adapters`), or `cpu` for plain Rust
     #[arg(long, value_name = "NAME|INDEX|cpu")]
@@ -102,6 +102,9 @@ const TUNING: FileName = ("tuning", "json");
 /// Of what the driver compiled.
 const PIPELINES: FileName = ("pipelines", "bin");
 
+/// Names another folder for [`PIPELINES`]: `bench` starts this program with an empty one.
+pub(super) const PIPELINES_FOLDER: &str = "WHEREABOT_PIPELINES";
+
 /// Empty where there is nothing yet, or users have no folder for caches.
 fn remembered(device: &Device, name: FileName) -> Vec<u8> {
     let bytes = cache_file(device, name).and_then(|file| fs::read(file).ok());
@@ -125,10 +128,15 @@ fn keep(device: &Device, name: FileName, bytes: &[u8]) {
 }
 
 /// Where what is known of an adapter is kept; `None` where users have no folder for caches.
-fn cache_file(device: &Device, (begin, end): FileName) -> Option<PathBuf> {
+fn cache_file(device: &Device, name: FileName) -> Option<PathBuf> {
     let adapter = device.info().name.to_lowercase();
     let adapter = adapter.replace(|c: char| !c.is_ascii_alphanumeric(), "-");
-    let folder = dirs::cache_dir()?.join("whereabot");
+    let other = std::env::var_os(PIPELINES_FOLDER).filter(|_| name == PIPELINES);
+    let folder = match other {
+        Some(folder) => folder.into(),
+        None => dirs::cache_dir()?.join("whereabot"),
+    };
+    let (begin, end) = name;
     Some(folder.join(format!("{begin}-{adapter}.{end}")))
 }
 

@@ -32,7 +32,7 @@ use crate::network::{Description, Model};
 /// and once a second statistics. Always the newest frame of each camera is searched; older ones are dropped and
 /// counted. A camera that fails is opened again and delays no other. Stops with Ctrl-C, SIGTERM, or when all
 /// sources came to their end. Videos, streams and webcams are read by ffmpeg (5.1 or newer), which must be on the
-/// PATH. Exits with 0; with 1 if it could not start; with 2 on wrong usage.
+/// PATH. Exits with 0; with 1 if it could not start, or could not write what it found; with 2 on wrong usage.
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// The cameras (see docs/watch.md)
@@ -85,21 +85,24 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
         }
     }
     let stop = Arc::new(Stop::default());
-    let (say, words) = mpsc::channel();
-    let mut sinks = sinks(&args, &config, &models, &say, &stop)?;
     // Open until the end.
     let page = page(&args, cameras, &models)?;
-    sinks.extend(page.iter().map(|page| Box::new(page.sink()) as _));
-    let mask = sinks.iter().any(|sink| sink.wants_masks());
-    let engine = engine(args, models, cameras.len(), mask)?;
+    let mask = args.record.is_some() || args.serve.is_some();
+    let engine = engine(&args, &models, cameras.len(), mask)?;
     stop_on_signals(&stop).context("signals cannot be handled")?;
+    // Last: they make files, and do what warnings ask for.
+    let (say, words) = mpsc::channel();
+    let unwritten = Arc::new(AtomicBool::new(false));
+    let mut sinks = sinks(&args, &config, &models, &say, &stop, &unwritten)?;
+    sinks.extend(page.iter().map(|page| Box::new(page.sink()) as _));
     let inputs = cameras.iter().map(CameraConfig::input).collect();
-    let mut done = ExitCode::SUCCESS;
-    for error in watch(inputs, engine, sinks, words, &stop) {
-        log::error!("{error}");
-        done = ExitCode::FAILURE;
-    }
-    Ok(done)
+    let errors = watch(inputs, engine, sinks, words, &stop);
+    errors.iter().for_each(|error| log::error!("{error}"));
+    Ok(if errors.is_empty() && !unwritten.load(Ordering::Relaxed) {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    })
 }
 
 /// Sets `stop` on Ctrl-C and SIGTERM.
@@ -120,23 +123,25 @@ fn stop_on_signals(stop: &Arc<Stop>) -> io::Result<()> {
     Ok(())
 }
 
-/// Where results go.
+/// Where results go. `unwritten` is set where stdout took no more, but its reader did not leave.
 fn sinks(
     args: &Args,
     config: &Config,
     models: &Models,
     say: &Sender<Word>,
     stop: &Arc<Stop>,
+    unwritten: &Arc<AtomicBool>,
 ) -> anyhow::Result<Vec<Box<dyn Sink>>> {
     let cameras = &config.cameras;
     let named = cameras.iter().map(|camera| Named {
         camera: camera.name.clone(),
         robot: models.robot(camera.robot.place).to_owned(),
     });
-    let closed = Arc::clone(stop);
+    let (closed, unwritten) = (Arc::clone(stop), Arc::clone(unwritten));
     let lines = Lines::new(named.collect(), io::stdout(), move |error| {
         if error.kind() != io::ErrorKind::BrokenPipe {
             log::error!("stdout: {error}");
+            unwritten.store(true, Ordering::Relaxed);
         }
         // The reader, such as `head`, has what it wanted.
         closed.set();
@@ -239,19 +244,19 @@ fn config(args: &Args, models: &mut Models) -> anyhow::Result<Config> {
 }
 
 fn engine(
-    args: Args,
-    models: Models,
+    args: &Args,
+    models: &Models,
     cameras: usize,
     mask: bool,
 ) -> anyhow::Result<Box<dyn Engine>> {
-    let models: Vec<Model> = models.0.into_iter().map(|(_, model)| model).collect();
+    let models: Vec<Model> = models.0.iter().map(|(_, model)| model.clone()).collect();
     let precision = args.precision.into();
     let Some(device) = args.engine.open()? else {
         engine::ensure_f32(precision)?;
         return Ok(Box::new(CpuEngine::new(&models, mask)));
     };
     let mut first = Some(Arc::clone(&device));
-    let request = args.engine;
+    let request = args.engine.clone();
     let reopen = move || -> Result<Arc<Device>, GpuError> {
         match first.take() {
             Some(device) => Ok(device),

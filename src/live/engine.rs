@@ -14,6 +14,9 @@ use crate::network::Model;
 
 /// What searches frames, some a submission.
 pub trait Engine: Send {
+    /// The longest side of a frame that it takes, in pixels.
+    fn max_side(&self) -> u32;
+
     /// How many of `ready` frames (at least one) of robot `robot` go into one submission.
     fn batch(&self, robot: usize, ready: usize) -> usize;
 
@@ -49,6 +52,7 @@ pub struct GpuEngine {
     open: OpenDevice,
     models: Vec<Model>,
     options: GpuOptions,
+    max_side: u32,
     /// Of each robot, the locators by their batch's size, the largest first.
     robots: Vec<Vec<(usize, BatchLocator)>>,
     /// Robot and place of those that run a submission, the oldest first.
@@ -84,6 +88,7 @@ impl GpuEngine {
             open,
             models,
             options,
+            max_side: 0,
             robots: Vec::new(),
             under_way: VecDeque::with_capacity(IN_FLIGHT),
         };
@@ -93,6 +98,10 @@ impl GpuEngine {
 }
 
 impl Engine for GpuEngine {
+    fn max_side(&self) -> u32 {
+        self.max_side
+    }
+
     fn batch(&self, robot: usize, ready: usize) -> usize {
         let sizes = self.robots.get(robot).into_iter().flatten();
         let mut sizes = sizes.map(|&(size, _)| size);
@@ -141,6 +150,7 @@ impl Engine for GpuEngine {
         self.under_way.clear();
         self.robots.clear();
         let device = (self.open)()?;
+        self.max_side = device.wgpu().limits().max_texture_dimension_2d;
         let largest = if device.info().device_type == wgpu::DeviceType::Cpu {
             1
         } else {
@@ -223,6 +233,10 @@ impl CpuEngine {
 }
 
 impl Engine for CpuEngine {
+    fn max_side(&self) -> u32 {
+        u32::MAX
+    }
+
     fn batch(&self, _robot: usize, _ready: usize) -> usize {
         1
     }

@@ -117,11 +117,6 @@ pub type SinkError = Box<dyn std::error::Error + Send + Sync>;
 /// Where results go. Calls come from one thread, in order, and must not wait: what writes to a disk or a network has
 /// a thread and a bounded queue of its own.
 pub trait Sink: Send {
-    /// Whether it needs the masks of the estimates, which are read back only then.
-    fn wants_masks(&self) -> bool {
-        false
-    }
-
     /// A frame was searched.
     fn observation(&mut self, observation: &Observation);
 

@@ -14,6 +14,8 @@ use crate::camera::{Camera, Crop, Orientation, Texels};
 pub(super) struct Reader {
     pub camera: usize,
     pub input: Input,
+    /// The longest side that the engine takes, in pixels.
+    pub max_side: u32,
     pub mailboxes: Arc<Mailboxes>,
     pub messages: Sender<Message>,
     pub stop: Arc<Stop>,
@@ -104,12 +106,10 @@ impl Reader {
                 .camera(stored.width(), stored.height())?,
         };
         let longest = camera.width.max(camera.height);
-        if longest > Self::MAX_SIDE || camera.width.min(camera.height) == 0 {
+        if longest > self.max_side || camera.width.min(camera.height) == 0 {
             return Err(SourceError::Frame(format!(
                 "expected an image of 1 to {} pixels on a side, found {} x {}",
-                Self::MAX_SIDE,
-                camera.width,
-                camera.height
+                self.max_side, camera.width, camera.height
             )));
         }
         if !upright {
@@ -125,9 +125,6 @@ impl Reader {
             view: oriented(camera, orientation),
         }))
     }
-
-    /// What every device takes (WebGPU's default of `maxTextureDimension2D`).
-    const MAX_SIDE: u32 = 8192;
 
     /// Tells what went wrong and waits: whether everything is to stop.
     fn wait(&self, error: &SourceError, patience: &mut Patience) -> bool {

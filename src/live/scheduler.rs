@@ -26,6 +26,8 @@ pub(super) struct Scheduler {
     round: u64,
     under_way: VecDeque<Submission>,
     service: Service,
+    /// How long to wait before a device is opened again: not at all after an answer.
+    patience: Duration,
     /// Used again each time: the cameras that have a frame.
     fresh: Vec<usize>,
 }
@@ -39,8 +41,9 @@ impl Scheduler {
     /// Between two looks at the engine, at least; at most as long as this while nothing happens.
     const POLL: Duration = Duration::from_micros(200);
     const IDLE: Duration = Duration::from_millis(50);
-    /// The longest time between tries to open a device.
-    const RETRY: Duration = Duration::from_secs(5);
+    /// Between two tries to open a device: twice as long each time.
+    const RETRY: Duration = Duration::from_millis(100);
+    const RETRY_MOST: Duration = Duration::from_secs(5);
 
     pub fn new(
         engine: Box<dyn Engine>,
@@ -60,6 +63,7 @@ impl Scheduler {
             round: 0,
             under_way: VecDeque::with_capacity(IN_FLIGHT),
             service: Service::default(),
+            patience: Duration::ZERO,
         }
     }
 
@@ -142,6 +146,7 @@ impl Scheduler {
     /// Tells what was found in the oldest submission.
     fn answer(&mut self, estimates: Vec<Estimate>) {
         let answered_at = Instant::now();
+        self.patience = Duration::ZERO;
         let Some(submission) = self.under_way.pop_front() else {
             return;
         };
@@ -171,15 +176,16 @@ impl Scheduler {
         self.tell(Message::DeviceLost {
             reason: error.to_string(),
         });
-        let mut wait = Duration::from_millis(100);
-        while let Err(error) = self.engine.reopen() {
-            log::warn!("no device: {error}; tried again in {wait:?}");
-            if self.stop.wait(wait) {
+        loop {
+            if !self.patience.is_zero() && self.stop.wait(self.patience) {
                 return;
             }
-            wait = (2 * wait).min(Self::RETRY);
+            self.patience = (2 * self.patience).clamp(Self::RETRY, Self::RETRY_MOST);
+            match self.engine.reopen() {
+                Ok(()) => return self.tell(Message::DeviceBack),
+                Err(error) => log::warn!("no device: {error}; tried again in {:?}", self.patience),
+            }
         }
-        self.tell(Message::DeviceBack);
     }
 
     fn tell(&self, message: Message) {

@@ -24,6 +24,7 @@ pub fn watch(
     stop: &Arc<Stop>,
 ) -> Vec<SinkError> {
     let mailboxes = Arc::new(Mailboxes::new(inputs.len()));
+    let max_side = engine.max_side();
     let (sender, messages) = channel();
     let robots = inputs.iter().map(|input| input.robot).collect();
     let pulses = inputs.iter().map(|_| Pulse::default()).collect();
@@ -39,6 +40,7 @@ pub fn watch(
         let reader = Reader {
             camera,
             input,
+            max_side,
             mailboxes: Arc::clone(&mailboxes),
             messages: sender.clone(),
             stop: Arc::clone(stop),

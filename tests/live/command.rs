@@ -121,6 +121,36 @@ fn a_reader_that_leaves_ends_it() {
 }
 
 #[test]
+#[cfg(target_os = "linux")]
+fn a_full_disk_ends_it_with_1() {
+    let folder = folder(&(PHOTOS.to_owned() + "repeat = true\n"));
+    sources::folder(&folder.path().join("photos"), 5);
+    let full = std::fs::File::options().write(true).open("/dev/full");
+    let output = command(folder.path())
+        .args(["--adapter", "cpu", "cameras.toml"])
+        .stdout(full.unwrap())
+        .output()
+        .unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("stdout: "), "{said}");
+}
+
+#[test]
+fn what_cannot_start_leaves_no_file() {
+    let folder = folder(PHOTOS);
+    sources::folder(&folder.path().join("photos"), 2);
+    let record = |adapter| {
+        let mut command = command(folder.path());
+        command.args(["cameras.toml", "--record", "out.mcap", "--adapter", adapter]);
+        let code = command.output().unwrap().status.code();
+        (code, folder.path().join("out.mcap").exists())
+    };
+    assert_eq!(record("voodoo"), (Some(2), false));
+    assert_eq!(record("cpu"), (Some(0), true));
+}
+
+#[test]
 fn cameras_can_do_without_a_file() {
     let folder = folder("");
     sources::folder(&folder.path().join("a"), 2);

@@ -99,6 +99,31 @@ fn without_overload_every_frame_is_answered() {
 }
 
 #[test]
+fn frames_that_the_engine_cannot_take_are_their_camera_s_failure() {
+    let run = |max_side| {
+        let mut engine = StandIn::new(5 * MS, 1);
+        engine.max_side = max_side;
+        let collector = run(vec![Simulated::new(20 * MS, 3).input()], engine);
+        let events = collector.events().into_iter();
+        let failures = events.filter_map(|(camera, kind)| match kind {
+            EventKind::Failed { reason, .. } => Some((camera, reason)),
+            EventKind::DeviceLost { reason } => panic!("{reason}"),
+            _ => None,
+        });
+        (failures.collect::<Vec<_>>(), collector.observations().len())
+    };
+    assert_eq!(run(64), (Vec::new(), 3));
+    let (failures, answers) = run(63);
+    assert_eq!(answers, 0);
+    let (camera, reason) = &failures[0];
+    assert_eq!(*camera, Some(0));
+    assert!(
+        reason.contains("1 to 63 pixels on a side, found 64 x 48"),
+        "{reason}"
+    );
+}
+
+#[test]
 fn a_camera_that_pauses_is_stale_and_no_other_is_disturbed() {
     let paused = Simulated {
         pause: Some((10, 1500 * MS)),

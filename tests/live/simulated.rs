@@ -122,6 +122,7 @@ impl Stream for Frames {
 pub struct StandIn {
     pub service: Duration,
     pub batch: usize,
+    pub max_side: u32,
     under_way: VecDeque<(Instant, usize)>,
 }
 
@@ -130,12 +131,17 @@ impl StandIn {
         Self {
             service,
             batch,
+            max_side: 8192,
             under_way: VecDeque::new(),
         }
     }
 }
 
 impl Engine for StandIn {
+    fn max_side(&self) -> u32 {
+        self.max_side
+    }
+
     fn batch(&self, _robot: usize, ready: usize) -> usize {
         ready.min(self.batch)
     }
@@ -188,7 +194,6 @@ pub enum Told {
 #[derive(Clone, Default)]
 pub struct Collector {
     pub told: Arc<Mutex<Vec<Told>>>,
-    pub masks: bool,
 }
 
 impl Collector {
@@ -233,9 +238,5 @@ impl Sink for Collector {
     fn statistics(&mut self, statistics: &Statistics) {
         let told = Told::Statistics(statistics.clone());
         self.told.lock().unwrap().push(told);
-    }
-
-    fn wants_masks(&self) -> bool {
-        self.masks
     }
 }

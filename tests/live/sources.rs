@@ -95,10 +95,7 @@ fn four_sources_at_once_are_answered_as_single_images() {
         camera
     });
     let inputs = cameras.iter().map(CameraConfig::input).collect();
-    let collector = Collector {
-        masks: true,
-        ..Collector::default()
-    };
+    let collector = Collector::default();
     let sinks = vec![Box::new(collector.clone()) as _];
     let stop = Arc::new(Stop::default());
     let (engine, _) = engine(4, true);

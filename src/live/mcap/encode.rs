@@ -134,7 +134,7 @@ impl Encoder {
                     poses: add("joint_poses", &POSE_ARRAY)?,
                     status: add("status", &DIAGNOSTIC_ARRAY)?,
                     link: format!("{name}_link"),
-                    optical: format!("{name}_optical"),
+                    optical: optical_frame(&camera.name),
                     camera: camera.clone(),
                 })
             })
@@ -505,13 +505,18 @@ fn failed<E: std::fmt::Display>(what: &str) -> impl Fn(E) -> String {
 }
 
 /// A camera's name as a part of a topic and as a frame: letters, digits and `_`, and no digit first.
-fn ros_name(name: &str) -> String {
+pub fn ros_name(name: &str) -> String {
     let begins_with_digit = name.starts_with(|c: char| c.is_ascii_digit());
     let first = (begins_with_digit || name.is_empty()).then_some('_');
     let rest = name
         .chars()
         .map(|c| if c.is_ascii_alphanumeric() { c } else { '_' });
     first.into_iter().chain(rest).collect()
+}
+
+/// The frame of what a camera of this name sees: optical, as REP 103 has it.
+pub fn optical_frame(camera: &str) -> String {
+    format!("{}_optical", ros_name(camera))
 }
 
 /// Refuses cameras of the same topics.

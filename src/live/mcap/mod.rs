@@ -26,6 +26,8 @@ mod recorder;
 use std::path::PathBuf;
 
 pub use encode::RecordedCamera;
+#[cfg(feature = "cli")]
+pub(crate) use encode::{optical_frame, ros_name};
 pub use recorder::Recorder;
 
 /// Why a recording could not be made, or ended early.

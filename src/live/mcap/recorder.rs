@@ -14,7 +14,7 @@ use super::McapError;
 use super::encode::{Encoder, RecordedCamera, check_names};
 use crate::live::{Event, Observation, Sink, Statistics};
 
-/// Writes what it is given to an MCAP file, in a thread of its own.
+/// Writes what it is given to an MCAP file, in a thread of its own: masks too, where estimates have them.
 ///
 /// What the thread does not keep up with is not recorded, by whole observations, and counted: nobody waits for a disk.
 /// A second of the file is complete when it is over, so that a program that is killed loses no more than that.
@@ -192,10 +192,6 @@ impl Recorder {
 }
 
 impl Sink for Recorder {
-    fn wants_masks(&self) -> bool {
-        true
-    }
-
     fn observation(&mut self, observation: &Observation) {
         self.push(Item::Observation(Box::new(observation.clone())));
     }

@@ -152,7 +152,7 @@ impl Server {
         }
     }
 
-    /// A way in for results; there may be several.
+    /// A way in for results, with masks where those are to be seen; there may be several.
     pub fn sink(&self) -> PageSink {
         PageSink {
             board: self.site.board.clone(),
@@ -198,10 +198,6 @@ impl Sink for PageSink {
 
     fn statistics(&mut self, statistics: &Statistics) {
         self.board.count(statistics);
-    }
-
-    fn wants_masks(&self) -> bool {
-        true
     }
 }
 
