@@ -294,7 +294,7 @@ fn a_pose_is_told_in_the_forms_of_ros() {
         "{text}"
     );
     assert!(
-        text.contains("--frame-id base_link --child-frame-id left_cam_optical_frame"),
+        text.contains("--frame-id base_link --child-frame-id left_cam_optical"),
         "{text}"
     );
     assert!(
@@ -305,7 +305,7 @@ fn a_pose_is_told_in_the_forms_of_ros() {
     let yaml: Value = serde_saphyr::from_str(&run(&["--yaml"])).unwrap();
     let transform = &yaml["transforms"][0];
     assert_eq!(transform["header"]["frame_id"], "base_link");
-    assert_eq!(transform["child_frame_id"], "left_cam_optical_frame");
+    assert_eq!(transform["child_frame_id"], "left_cam_optical");
     assert!((transform["transform"]["translation"]["y"].as_f64().unwrap() - y).abs() < 1e-6);
     let launch: Value = serde_saphyr::from_str(&run(&["--launch"])).unwrap();
     let node = &launch["launch"][0]["node"];
@@ -320,6 +320,44 @@ fn a_pose_is_told_in_the_forms_of_ros() {
     );
     let (_, _, code) = bench.calibrate(&["lines", "--angles", "angles.csv", "--json", "--yaml"]);
     assert_eq!(code, 2);
+}
+
+#[test]
+fn cameras_that_cannot_be_told_apart_are_refused() {
+    let bench = Bench::new();
+    let lines = |camera: &str| watched(&bench, camera, camera_from_base(0.5));
+    let nameless = lines("left").replace("\"camera\":\"left\",", "");
+    for folder in ["left", "right"] {
+        std::fs::create_dir(bench.folder.path().join(folder)).unwrap();
+        bench.write(&format!("{folder}/locate.jsonl"), &nameless);
+    }
+    bench.write("other.jsonl", &nameless);
+    bench.write(
+        "angles.csv",
+        &table(&format!("time_s,{}", JOINTS.join(",")), ","),
+    );
+    let angles = ["--angles", "angles.csv"];
+    let stderr =
+        bench.refused(&[&["left/locate.jsonl", "right/locate.jsonl"], &angles[..]].concat());
+    assert!(
+        stderr.contains("camera locate in one file, found some in left/locate.jsonl: rename one"),
+        "{stderr}"
+    );
+    // Negative control: another name is another camera.
+    let (stdout, stderr, code) =
+        bench.calibrate(&[&["left/locate.jsonl", "other.jsonl"], &angles[..]].concat());
+    assert_eq!(code, 0, "{stderr}");
+    assert!(
+        stdout.contains("locate") && stdout.contains("other"),
+        "{stdout}"
+    );
+
+    bench.write("names.jsonl", &(lines("left-1") + &lines("left_1")));
+    let stderr = bench.refused(&[&["names.jsonl"], &angles[..]].concat());
+    assert!(
+        stderr.contains("found left-1 and left_1, both left_1_optical"),
+        "{stderr}"
+    );
 }
 
 #[test]

@@ -564,8 +564,9 @@ fn camera_files_that_are_none_are_refused() {
 fn wrong_usage_exits_with_2() {
     let bench = Bench::new();
     bench.image("white.png", 96, 72, WHITE);
-    let cases: [(&[&str], &str); 9] = [
+    let cases: [(&[&str], &str); 10] = [
         (&["--adapter", "voodoo"], "there are:"),
+        (&["--soft-mask"], "--out"),
         (&["--backend", "glide"], "vulkan, metal, dx12, gl"),
         (&["--camera", "a.yaml", "--hfov", "70"], "--hfov"),
         (&["--hfov", "180"], "between 0 and 180"),

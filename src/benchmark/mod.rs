@@ -31,7 +31,7 @@ pub struct Options {
     /// What to compute in.
     pub precisions: Vec<Precision>,
     /// How often each batch is measured; `None` for as often as three seconds hold, but at least three
-    /// times.
+    /// times and at most 500.
     pub runs: Option<usize>,
     /// Use the GPU's clock where it has one.
     pub timestamps: bool,

@@ -227,18 +227,18 @@ impl HostLocator {
         let view = View::of(last, camera, size, texels, &self.description)?;
         self.plan
             .bind(&self.device, index, &source.planes, &view.rectification)?;
+        if let Some(place) = self.views.get_mut(index) {
+            *place = Some(view);
+        }
         if last != Some(view) {
+            let max_radius = view.rectification.max_radius;
+            self.outputs.set_max_radius(&self.device, index, max_radius);
             if self.mask == MaskSize::Source {
                 let canonical = &self.description.camera;
                 let params = Unrectification::new(camera, canonical, crop, source.orientation);
                 self.outputs
                     .set_mask(&self.device, &self.plan, index, params)?;
             }
-            let max_radius = view.rectification.max_radius;
-            self.outputs.set_max_radius(&self.device, index, max_radius);
-        }
-        if let Some(place) = self.views.get_mut(index) {
-            *place = Some(view);
         }
         Ok(())
     }

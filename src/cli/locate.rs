@@ -51,7 +51,7 @@ pub struct Args {
     #[arg(long)]
     mask_only: bool,
     /// Mask pictures of probabilities (0 to 255), not of 0 and 255
-    #[arg(long)]
+    #[arg(long, requires = "out")]
     soft_mask: bool,
     /// One line of JSON an image
     #[arg(long)]
@@ -166,8 +166,9 @@ impl<'a> Engine<'a> {
     ) -> anyhow::Result<Estimate> {
         // A device with a fault stays at it: the next image gets another one.
         if self.device.as_ref().is_some_and(|d| d.check().is_err()) {
-            self.device = self.args.open()?;
-            self.locator = engine::locator(&self.model, self.device.as_ref(), self.precision)?;
+            let device = self.args.open()?;
+            self.locator = engine::locator(&self.model, device.as_ref(), self.precision)?;
+            self.device = device;
         }
         Ok(self.locator.locate(&photo.image, camera, output)?)
     }

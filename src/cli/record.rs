@@ -27,7 +27,7 @@ pub struct Args {
     package: Vec<(String, PathBuf)>,
     /// Another body of the same robot: where its joints' points are (JSON) and its URDF; repeatable.
     /// With a free camera the robot has one of these bodies as often as its own
-    #[arg(long, value_name = "FRAMES=URDF", value_parser = body)]
+    #[arg(long, value_name = "FRAMES=URDF", value_parser = body, conflicts_with_all = ["paper", "fixed_camera"])]
     body: Vec<(PathBuf, PathBuf)>,
     /// The robot's name, which the recording carries
     #[arg(long, value_name = "NAME", required_unless_present = "paper")]

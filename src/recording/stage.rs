@@ -335,7 +335,7 @@ impl Stage {
                     continue;
                 }
                 let second = if rng.random_bool(0.14) {
-                    self.second(&arm, camera, &window, &mut rng)
+                    self.second(&arm, &views, &mut rng)
                 } else {
                     None
                 };
@@ -548,16 +548,13 @@ impl Stage {
         (fits && !low && arm.in_view(camera, window)? >= inside.min(arm.joints())).then_some(camera)
     }
 
-    /// A second arm in the same place, clear of the first and smaller in the picture.
-    fn second(
-        &self,
-        first: &Arm,
-        camera: DAffine3,
-        window: &Window,
-        rng: &mut ChaCha8Rng,
-    ) -> Option<Arm<'_>> {
+    /// A second arm in the same place, clear of the first, in the first of the `views`, and in all smaller than the first.
+    fn second(&self, first: &Arm, views: &[View], rng: &mut ChaCha8Rng) -> Option<Arm<'_>> {
         let spine = first.body.robot.spine(&first.poses);
-        let largest = self.coverage(camera, first, window);
+        let covers =
+            |view: &View, arm: &Arm| self.coverage(view.camera_from_base, arm, &view.window);
+        let largest: Vec<f64> = views.iter().map(|view| covers(view, first)).collect();
+        let main = views.first()?;
         (0..12).find_map(|_| {
             let mut arm = self.any_body(rng).any_arm(rng)?;
             let distance = arm.body.reach * rng.random_range(0.5..1.8);
@@ -577,14 +574,16 @@ impl Stage {
                 .windows(2)
                 .flat_map(|ends| [ends[0], 0.5 * (ends[0] + ends[1])])
                 .all(|point| line_distance(&spine, point) > 0.2);
-            let near = camera.transform_point3(arm.base()).z < 0.6;
-            let seen = clear && !near && arm.in_view(camera, window) >= Some(1);
-            let share = if seen {
-                self.coverage(camera, &arm, window)
-            } else {
-                0.0
-            };
-            (share > 0.004 && share < largest).then_some(arm)
+            let is_far = |view: &View| view.camera_from_base.transform_point3(arm.base()).z >= 0.6;
+            let fits = clear
+                && views.iter().all(is_far)
+                && arm.in_view(main.camera_from_base, &main.window) >= Some(1)
+                && covers(main, &arm) > 0.004
+                && views
+                    .iter()
+                    .zip(&largest)
+                    .all(|(view, &largest)| covers(view, &arm) < largest);
+            fits.then_some(arm)
         })
     }
 

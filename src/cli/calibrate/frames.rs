@@ -40,10 +40,11 @@ struct Joint {
     xyz_m: [f64; 3],
 }
 
-/// The frames of each camera, in the lines' order. Lines that name no camera are of one that has the file's name.
-/// `-` is stdin.
+/// The frames of each camera, in the lines' order. Lines that name no camera are of one that has the file's name: two
+/// such files of one name are refused. `-` is stdin.
 pub fn read(files: &[impl AsRef<Path>]) -> anyhow::Result<BTreeMap<String, Vec<Frame>>> {
     let mut cameras: BTreeMap<String, Vec<Frame>> = BTreeMap::new();
+    let mut unnamed: BTreeMap<String, &Path> = BTreeMap::new();
     for file in files.iter().map(AsRef::as_ref) {
         let (name, reader): (&str, Box<dyn BufRead>) = if file.as_os_str() == "-" {
             ("camera", Box::new(io::stdin().lock()))
@@ -60,7 +61,16 @@ pub fn read(files: &[impl AsRef<Path>]) -> anyhow::Result<BTreeMap<String, Vec<F
             }
             let parsed: Line = serde_json::from_str(&line).with_context(|| place.clone())?;
             if let Some((camera, frame)) = frame(parsed, &place).with_context(|| place.clone())? {
-                let camera = camera.unwrap_or_else(|| name.to_owned());
+                let camera = camera.unwrap_or_else(|| {
+                    unnamed.entry(name.to_owned()).or_insert(file);
+                    name.to_owned()
+                });
+                let first = unnamed.get(&camera).copied().unwrap_or(file);
+                ensure!(
+                    first == file,
+                    "{place}: expected the frames of camera {camera} in one file, found some in {}: rename one",
+                    first.display()
+                );
                 cameras.entry(camera).or_default().push(frame);
             }
         }

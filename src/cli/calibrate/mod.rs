@@ -4,15 +4,16 @@ mod angles;
 mod frames;
 mod report;
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::io::{self, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::{Context, ensure};
+use anyhow::{Context, bail, ensure};
 use glam::DVec3;
 
 use crate::calibration::{Pair, Registration, register};
+use crate::live::mcap::optical_frame;
 use crate::recording::{Frames, Robot};
 use angles::Angles;
 use frames::Frame;
@@ -80,6 +81,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             .collect::<Vec<_>>()
             .join(", ")
     );
+    let mut named = BTreeMap::new();
+    for camera in cameras.keys() {
+        let frame = optical_frame(camera);
+        if let Some(first) = named.insert(frame.clone(), camera) {
+            bail!("expected cameras of different frames, found {first} and {camera}, both {frame}");
+        }
+    }
     let mut failed = false;
     let mut reports = Vec::new();
     for (camera, frames) in cameras {
@@ -184,7 +192,7 @@ fn calibrate(
         schema: 1,
         camera: camera.to_owned(),
         frame_id: robot.base_frame().to_owned(),
-        child_frame_id: format!("{}_optical_frame", report::ros_name(camera)),
+        child_frame_id: optical_frame(camera),
         translation_m: found.transform.translation.to_array(),
         rotation_xyzw: report::quaternion(&found),
         translation_sigma_m: found.translation_sigma_m(),

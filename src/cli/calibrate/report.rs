@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use super::angles::Match;
 use crate::calibration::Registration;
+use crate::live::mcap::ros_name;
 
 /// A camera's pose in the robot's base frame, and how sure it is.
 #[derive(Serialize)]
@@ -176,11 +177,6 @@ pub fn launch(reports: &[Report]) -> String {
         );
     }
     text
-}
-
-/// What ROS takes in names of frames and nodes.
-pub fn ros_name(text: &str) -> String {
-    text.replace(|c: char| !c.is_ascii_alphanumeric(), "_")
 }
 
 /// A YAML string: JSON's are.
