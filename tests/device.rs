@@ -94,11 +94,15 @@ fn a_network_beyond_the_adapter_s_limits_names_the_layer() {
     };
     let limits = device.wgpu().limits();
     let side = 4 * (limits.max_storage_buffer_binding_size as f64 / (4096.0 * 4.0)).sqrt() as usize;
-    for (layout, batch, side) in [
-        (Layout::Buffer, 1, side),
-        (Layout::Texture, limits.max_texture_array_layers as usize, 8),
+    for (layout, batch, [rows, columns]) in [
+        (Layout::Buffer, 32, [side, side / 256]),
+        (
+            Layout::Texture,
+            limits.max_texture_array_layers as usize,
+            [8, 1],
+        ),
     ] {
-        let network = one_layer(operation, Shape::new(1, side, side / 8), 1);
+        let network = one_layer(operation, Shape::new(1, rows, columns), 1);
         let input = NetworkPlan::input(&device, layout, "input", &network, batch).unwrap();
         let error = NetworkPlan::new(&device, "mask", &network, &input).unwrap_err();
         let text = error.to_string();
