@@ -87,6 +87,7 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
     let stop = Arc::new(Stop::default());
     // Open until the end.
     let page = page(&args, cameras, &models)?;
+    // Files and pages show masks.
     let mask = args.record.is_some() || args.serve.is_some();
     let engine = engine(&args, &models, cameras.len(), mask)?;
     stop_on_signals(&stop).context("signals cannot be handled")?;

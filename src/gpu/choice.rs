@@ -93,14 +93,18 @@ impl Conv2dKernel {
         fits && pools && self.layouts().contains(&conv.input.layout())
     }
 
-    /// Whether it is the better choice where nothing was measured. What is not known to be right on the adapter is
-    /// not, and on CPU rasterisers workgroup memory is slower than any other; for a large GPU there should be
-    /// workgroups enough.
+    /// Whether it is the better choice where nothing was measured. What was found to be wrong on the adapter is not, nor what
+    /// is experimental unless it was found to be right, and on CPU rasterisers workgroup memory is slower than any other; for a
+    /// large GPU there should be workgroups enough.
     fn suits(self, device: &Device, conv: &Conv2d<'_>) -> bool {
+        let right = is_right(device, self);
+        if right == Some(false) {
+            return false;
+        }
         match self {
             Self::Cooperative(pixels) => {
                 let enough = pixels == 32 || cooperative_workgroups(device, conv, pixels) >= 256;
-                enough && known(device, self)
+                enough && right == Some(true)
             }
             Self::One => !is_rasteriser(device.info()),
             Self::Tiled(pixels) => {
@@ -127,7 +131,7 @@ impl fmt::Display for Conv2dKernel {
 }
 
 /// Plans a convolution: by `only`, if it is given, or by what the device's tuner finds to be the fastest,
-/// or else by the first kernel that suits and that it did not refuse.
+/// or else by the first kernel that suits.
 pub(super) fn conv2d(
     device: &Device,
     conv: &Conv2d<'_>,
@@ -141,7 +145,7 @@ pub(super) fn conv2d(
             Some(fastest) => Some(fastest),
             None => candidates
                 .into_iter()
-                .find(|&kernel| kernel.suits(device, conv) && !refused(device, kernel)),
+                .find(|kernel| kernel.suits(device, conv)),
         },
     };
     match chosen {
@@ -168,25 +172,14 @@ fn tuned(
     }
 }
 
-/// Whether the device's tuner found `kernel` to answer rightly.
-fn known(device: &Device, kernel: Conv2dKernel) -> bool {
+/// Whether `kernel` answers rightly, as far as the device's tuner found out.
+fn is_right(device: &Device, kernel: Conv2dKernel) -> Option<bool> {
     #[cfg(not(target_arch = "wasm32"))]
-    return device.tuner().knows(kernel);
+    return device.tuner().is_right(kernel);
     #[cfg(target_arch = "wasm32")]
     {
         let _ = (device, kernel);
-        false
-    }
-}
-
-/// Whether the device's tuner found `kernel` to fail or to answer wrongly. `conv2d_buffer` is what it holds others to.
-fn refused(device: &Device, kernel: Conv2dKernel) -> bool {
-    #[cfg(not(target_arch = "wasm32"))]
-    return kernel != Conv2dKernel::Buffer && device.tuner().refuses(kernel);
-    #[cfg(target_arch = "wasm32")]
-    {
-        let _ = (device, kernel);
-        false
+        None
     }
 }
 

@@ -301,15 +301,10 @@ impl Device {
             let internal = self.device.push_error_scope(wgpu::ErrorFilter::Internal);
             let validation = self.device.push_error_scope(wgpu::ErrorFilter::Validation);
             let made = make();
-            let errors = [validation.pop(), internal.pop(), memory.pop()];
+            let [validation, internal, memory] =
+                [validation.pop(), internal.pop(), memory.pop()].map(pollster::block_on);
             // What could not be made is not valid either: that is the consequence.
-            if let Some(error) = errors
-                .map(pollster::block_on)
-                .into_iter()
-                .rev()
-                .flatten()
-                .next()
-            {
+            if let Some(error) = memory.or(internal).or(validation) {
                 return Err(convert(error));
             }
             made

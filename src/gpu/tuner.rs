@@ -90,7 +90,11 @@ impl Tuner {
         }
         let start = Instant::now();
         let found = fastest(device, conv, candidates, start + state.left)?;
-        state.refused.extend(found.refused);
+        // What the others are held to is none of them.
+        let refused = found.refused.into_iter();
+        state
+            .refused
+            .extend(refused.filter(|&kernel| kernel != Conv2dKernel::Buffer));
         state.left = state.left.saturating_sub(start.elapsed());
         if let Found {
             kernel: Some(fastest),
@@ -104,15 +108,15 @@ impl Tuner {
         Ok(found.kernel)
     }
 
-    /// Whether `kernel` was found to answer rightly on the adapter: it was the fastest for some layer.
-    pub fn knows(&self, kernel: Conv2dKernel) -> bool {
-        let name = kernel.to_string();
-        self.state().winners.values().any(|winner| *winner == name)
-    }
-
-    /// Whether `kernel` failed or answered wrongly on the adapter.
-    pub fn refuses(&self, kernel: Conv2dKernel) -> bool {
-        self.state().refused.contains(&kernel)
+    /// Whether `kernel` answers rightly on the adapter: so it does if it was the fastest for some layer, and was not refused for
+    /// another. `None` where nothing was found out.
+    pub fn is_right(&self, kernel: Conv2dKernel) -> Option<bool> {
+        let (state, name) = (self.state(), kernel.to_string());
+        if state.refused.contains(&kernel) {
+            return Some(false);
+        }
+        let won = state.winners.values().any(|winner| *winner == name);
+        won.then_some(true)
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
@@ -354,6 +358,7 @@ mod tests {
         // It binds textures, and gets buffers.
         assert_eq!(choose(&device, &tuner, &[Subgroup, Buffer]), Some(Buffer));
         // For later layers too, when there is no time left to look.
-        assert!(tuner.refuses(Subgroup) && !tuner.refuses(Buffer));
+        assert_eq!(tuner.is_right(Subgroup), Some(false));
+        assert_eq!(tuner.is_right(Buffer), Some(true));
     }
 }

@@ -17,6 +17,7 @@ mod observation;
 pub mod page;
 mod pulse;
 mod reader;
+pub(crate) mod ros;
 mod scheduler;
 mod service;
 mod source;

@@ -61,16 +61,18 @@ pub fn read(files: &[impl AsRef<Path>]) -> anyhow::Result<BTreeMap<String, Vec<F
             }
             let parsed: Line = serde_json::from_str(&line).with_context(|| place.clone())?;
             if let Some((camera, frame)) = frame(parsed, &place).with_context(|| place.clone())? {
-                let camera = camera.unwrap_or_else(|| {
-                    unnamed.entry(name.to_owned()).or_insert(file);
-                    name.to_owned()
-                });
-                let first = unnamed.get(&camera).copied().unwrap_or(file);
-                ensure!(
-                    first == file,
-                    "{place}: expected the frames of camera {camera} in one file, found some in {}: rename one",
-                    first.display()
-                );
+                let camera = match camera {
+                    Some(camera) => camera,
+                    None => {
+                        let first = *unnamed.entry(name.to_owned()).or_insert(file);
+                        ensure!(
+                            first == file,
+                            "{place}: expected the frames of camera {name} in one file, found some in {}: rename one",
+                            first.display()
+                        );
+                        name.to_owned()
+                    }
+                };
                 cameras.entry(camera).or_default().push(frame);
             }
         }

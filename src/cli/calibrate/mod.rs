@@ -4,7 +4,7 @@ mod angles;
 mod frames;
 mod report;
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 use std::io::{self, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -13,7 +13,7 @@ use anyhow::{Context, bail, ensure};
 use glam::DVec3;
 
 use crate::calibration::{Pair, Registration, register};
-use crate::live::mcap::optical_frame;
+use crate::live::ros;
 use crate::recording::{Frames, Robot};
 use angles::Angles;
 use frames::Frame;
@@ -81,12 +81,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             .collect::<Vec<_>>()
             .join(", ")
     );
-    let mut named = BTreeMap::new();
-    for camera in cameras.keys() {
-        let frame = optical_frame(camera);
-        if let Some(first) = named.insert(frame.clone(), camera) {
-            bail!("expected cameras of different frames, found {first} and {camera}, both {frame}");
-        }
+    if let Some([first, second]) = ros::alike(cameras.keys().map(String::as_str)) {
+        let frame = ros::optical_frame(second);
+        bail!("expected cameras of different frames, found {first} and {second}, both {frame}");
     }
     let mut failed = false;
     let mut reports = Vec::new();
@@ -192,7 +189,7 @@ fn calibrate(
         schema: 1,
         camera: camera.to_owned(),
         frame_id: robot.base_frame().to_owned(),
-        child_frame_id: optical_frame(camera),
+        child_frame_id: ros::optical_frame(camera),
         translation_m: found.transform.translation.to_array(),
         rotation_xyzw: report::quaternion(&found),
         translation_sigma_m: found.translation_sigma_m(),

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::angles::Match;
 use crate::calibration::Registration;
-use crate::live::mcap::ros_name;
+use crate::live::ros;
 
 /// A camera's pose in the robot's base frame, and how sure it is.
 #[derive(Serialize)]
@@ -172,7 +172,7 @@ pub fn launch(reports: &[Report]) -> String {
             "# {}: {}\n- node:\n    pkg: tf2_ros\n    exec: static_transform_publisher\n    name: {}\n    args: {}\n",
             report.camera,
             report.sure(),
-            quoted(&format!("{}_static_transform", ros_name(&report.camera))),
+            quoted(&format!("{}_static_transform", ros::name(&report.camera))),
             quoted(&report.arguments()),
         );
     }

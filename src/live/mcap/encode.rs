@@ -20,7 +20,7 @@ use crate::camera::Intrinsics;
 use crate::cascade::{Joint, Status};
 use crate::draw::{JOINT_COLOURS, mask_image};
 use crate::live::warning::{ActionReport, State, Warning};
-use crate::live::{Event, EventKind, Observation, Rates, Statistics};
+use crate::live::{Event, EventKind, Observation, Rates, Statistics, ros};
 
 /// A camera that is recorded.
 #[derive(Debug, Clone, PartialEq)]
@@ -116,7 +116,7 @@ impl Encoder {
         let cameras = cameras
             .iter()
             .map(|camera| {
-                let name = ros_name(&camera.name);
+                let name = ros::name(&camera.name);
                 let joints = camera.joints.join(" ");
                 let about = [
                     ("camera", camera.name.as_str()),
@@ -134,7 +134,7 @@ impl Encoder {
                     poses: add("joint_poses", &POSE_ARRAY)?,
                     status: add("status", &DIAGNOSTIC_ARRAY)?,
                     link: format!("{name}_link"),
-                    optical: optical_frame(&camera.name),
+                    optical: ros::optical_frame(&camera.name),
                     camera: camera.clone(),
                 })
             })
@@ -504,33 +504,14 @@ fn failed<E: std::fmt::Display>(what: &str) -> impl Fn(E) -> String {
     move |cause| format!("{what} could not be encoded: {cause}")
 }
 
-/// A camera's name as a part of a topic and as a frame: letters, digits and `_`, and no digit first.
-pub fn ros_name(name: &str) -> String {
-    let begins_with_digit = name.starts_with(|c: char| c.is_ascii_digit());
-    let first = (begins_with_digit || name.is_empty()).then_some('_');
-    let rest = name
-        .chars()
-        .map(|c| if c.is_ascii_alphanumeric() { c } else { '_' });
-    first.into_iter().chain(rest).collect()
-}
-
-/// The frame of what a camera of this name sees: optical, as REP 103 has it.
-pub fn optical_frame(camera: &str) -> String {
-    format!("{}_optical", ros_name(camera))
-}
-
 /// Refuses cameras of the same topics.
 pub fn check_names(cameras: &[RecordedCamera]) -> Result<(), McapError> {
-    let mut seen = BTreeMap::new();
-    for camera in cameras {
-        let topic = ros_name(&camera.name);
-        if let Some(first) = seen.insert(topic.clone(), &camera.name) {
-            return Err(McapError::SameTopic {
-                first: first.clone(),
-                second: camera.name.clone(),
-                topic,
-            });
-        }
+    if let Some([first, second]) = ros::alike(cameras.iter().map(|camera| camera.name.as_str())) {
+        return Err(McapError::SameTopic {
+            first: first.to_owned(),
+            second: second.to_owned(),
+            topic: ros::name(second),
+        });
     }
     Ok(())
 }

@@ -26,8 +26,6 @@ mod recorder;
 use std::path::PathBuf;
 
 pub use encode::RecordedCamera;
-#[cfg(feature = "cli")]
-pub(crate) use encode::{optical_frame, ros_name};
 pub use recorder::Recorder;
 
 /// Why a recording could not be made, or ended early.
