@@ -19,7 +19,7 @@ use Layout::{Buffer, HalfBuffer};
 
 /// What the library composes from the files in `shaders/`, and the constants that these want in their text:
 /// a file that nobody lists is not tested. Some have no layout: they bind their textures themselves, or draw.
-const KERNELS: [Kernel; 29] = [
+const KERNELS: [Kernel; 30] = [
     (&["back_project"], &Layout::ALL, &[]),
     (&["concat"], &Layout::ALL, &[]),
     (
@@ -107,6 +107,7 @@ const KERNELS: [Kernel; 29] = [
         &Layout::ALL,
         &[("JOINTS", 6)],
     ),
+    (&["kinematic_fit"], &Layout::ALL, &[]),
     (&["max_pool2d"], &Layout::ALL, &[]),
     (&["overlay_share", "overlay"], &Layout::ALL, &[]),
     (&["probe_arithmetic"], &[], &[]),

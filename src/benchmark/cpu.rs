@@ -140,8 +140,13 @@ fn layer_times(
     let joints = reference::run_each(&model.joint_network, &masked, |_| lap())
         .and_then(|mut outputs| outputs.pop())
         .ok_or(LocateError::Shape("joint network"))?;
+    let mut joints = joints.data().to_vec();
     if let Some(gaze) = gaze {
-        reference::zoom_joints(joints.data(), &gaze);
+        joints = reference::zoom_joints(&joints, &gaze);
+        lap();
+    }
+    if let Some(arm) = &model.description.arm {
+        reference::kinematic_fit(&joints, arm);
         lap();
     }
     Ok(times)
@@ -168,11 +173,12 @@ fn layer_works(model: &Model, batch: usize) -> Vec<LayerWork> {
     let name = if zooms { "zoom_overlay" } else { "overlay" };
     layers.push(between(name, 2 * image.len() + mask.len()));
     layers.extend(network_works("joint", &model.joint_network, batch));
+    let joints = 2 * model.joint_network.output().len();
     if zooms {
-        layers.push(between(
-            "zoom_joints",
-            2 * model.joint_network.output().len(),
-        ));
+        layers.push(between("zoom_joints", joints));
+    }
+    if model.description.arm.is_some() {
+        layers.push(between("kinematic_fit", joints));
     }
     layers
 }

@@ -68,6 +68,20 @@ fn card(model: &Model, file_size: usize) -> String {
             zoom.spread, zoom.least, zoom.most
         ),
     };
+    let arm = match &description.arm {
+        None => "joints stay where the network puts them".to_owned(),
+        Some(arm) => {
+            let bodies = arm
+                .bodies
+                .iter()
+                .map(|links| format!("{} + {} m", links.upper_arm, links.forearm));
+            let bodies: Vec<_> = bodies.collect();
+            format!(
+                "joints fitted to upper arm + forearm of {}",
+                bodies.join(" or ")
+            )
+        }
+    };
     let camera = description.camera;
     let mut text = format!(
         "robot       {}\n\
@@ -76,6 +90,7 @@ fn card(model: &Model, file_size: usize) -> String {
          input       {} x {} pixels, fx {} fy {} cx {} cy {}\n\
          overlay     {overlay}\n\
          zoom        {zoom}\n\
+         arm         {arm}\n\
          mask        probability of at least {}\n\
          presence    probability of at least {} on {} % of the input\n\
          size        {} MMAC an image, {parameters} parameters, {} KiB\n",

@@ -1,6 +1,7 @@
 use image::RgbaImage;
 
 use super::coverage::{Totals, coverage};
+use super::kinematic_fit::kinematic_fit;
 use super::overlay::overlay;
 use super::rectify::Rectify;
 use super::source::Planes;
@@ -24,14 +25,15 @@ pub struct Plan {
     /// From the mask to the joint network's input.
     overlay: Vec<Step>,
     joint: NetworkPlan,
-    zoomed: Option<Zoomed>,
+    behind: Vec<Behind>,
     results: wgpu::Buffer,
     masks: wgpu::Buffer,
 }
 
-/// Behind a joint network that looks through a camera of its own: its joints in the canonical camera's frame.
+/// A step behind the joint network: its joints in the canonical camera's frame, where it looks through a camera of its own, or
+/// where an arm can have them.
 #[derive(Debug)]
-struct Zoomed {
+struct Behind {
     step: Step,
     joints: Tensor,
 }
@@ -109,21 +111,28 @@ impl Plan {
             let thresholds = (presence.mask_threshold, presence.sure_threshold);
             let coverage = coverage(device, output, &totals, thresholds)?;
             let rule = description.overlay;
-            let (overlay, zoomed) = match description.zoom {
-                None => {
-                    let overlay = overlay(device, &image, output, &masked, rule)?;
-                    (vec![overlay], None)
-                }
+            let seen = joint.output();
+            let joints = || Tensor::in_layout(device, layout, "joints", seen.shape, batch, 0);
+            let mut behind: Vec<Behind> = Vec::new();
+            let overlay = match description.zoom {
+                None => vec![overlay(device, &image, output, &masked, rule)?],
                 Some(zoom) => {
                     let gazes = Gazes::new(device, description.camera, batch)?;
-                    let seen = joint.output();
-                    let joints = Tensor::in_layout(device, layout, "joints", seen.shape, batch, 0)?;
-                    let zoom = gazes.zoom(device, output, zoom, rule)?;
-                    let overlay = gazes.zoom_overlay(device, &image, output, &masked, rule)?;
+                    let joints = joints()?;
                     let step = gazes.zoom_joints(device, seen, &joints)?;
-                    (vec![zoom, overlay], Some(Zoomed { step, joints }))
+                    behind.push(Behind { step, joints });
+                    vec![
+                        gazes.zoom(device, output, zoom, rule)?,
+                        gazes.zoom_overlay(device, &image, output, &masked, rule)?,
+                    ]
                 }
             };
+            if let Some(arm) = &description.arm {
+                let joints = joints()?;
+                let before = behind.last().map_or(seen, |step| &step.joints);
+                let step = kinematic_fit(device, before, &joints, arm)?;
+                behind.push(Behind { step, joints });
+            }
             let results = staging_buffer(device, joint.output().staging_size() + totals.size());
             let masks = staging_buffer(device, output.staging_size());
             Ok(Self {
@@ -136,7 +145,7 @@ impl Plan {
                 masks,
                 mask,
                 joint,
-                zoomed,
+                behind,
             })
         })
     }
@@ -206,10 +215,8 @@ impl Plan {
 
     /// The joints in the canonical camera's frame: `[3 joints, 1, 1]`.
     pub(super) fn joints(&self) -> &Tensor {
-        match &self.zoomed {
-            Some(zoomed) => &zoomed.joints,
-            None => self.joint.output(),
-        }
+        let joints = self.behind.last().map(|step| &step.joints);
+        joints.unwrap_or_else(|| self.joint.output())
     }
 
     /// What there is to see in the masks: one [`Totals`] an image.
@@ -219,8 +226,8 @@ impl Plan {
 
     /// The dispatches from masks to joints.
     fn joint_steps(&self) -> impl Iterator<Item = &Step> {
-        let back = self.zoomed.as_ref().map(|zoomed| &zoomed.step);
-        self.overlay.iter().chain(self.joint.steps()).chain(back)
+        let behind = self.behind.iter().map(|behind| &behind.step);
+        self.overlay.iter().chain(self.joint.steps()).chain(behind)
     }
 
     /// The dispatches of a frame, in order; those of the joint network only `with_joints`.

@@ -1,6 +1,6 @@
 use serde::{Deserialize, Serialize};
 
-use super::{Layer, NetworkError};
+use super::{Arm, Layer, NetworkError};
 use crate::camera::Intrinsics;
 
 /// Everything about a model that is not a tensor: the JSON under the key `whereabot` of a model
@@ -30,6 +30,9 @@ pub struct Description {
     /// From the overlay `[3, height, width]` to `x, y, z` of each joint, in metres, in the camera
     /// optical frame.
     pub joint_network: NetworkDescription,
+    /// What moves the joint network's joints to where an arm can have them; without it, they stay where they are.
+    #[serde(default)]
+    pub arm: Option<Arm>,
     /// When a mask means that there is a robot.
     pub presence: Presence,
     /// The model card: data, protocol, figures. Free in form.
@@ -205,6 +208,9 @@ impl Description {
                      {least}, most {most}"
                 ));
             }
+        }
+        if let Some(arm) = &self.arm {
+            arm.check(self.joints.len())?;
         }
         if !(0.0..=1.0).contains(&self.presence.min_sure) {
             return Err(format!(

@@ -1,5 +1,6 @@
 //! What a network is: layers, shapes, the model file. No GPU here.
 
+mod arm;
 mod coverage;
 mod description;
 mod graph;
@@ -7,6 +8,7 @@ mod layer;
 mod model;
 mod shape;
 
+pub use arm::{Arm, Links};
 pub use coverage::Coverage;
 pub use description::{Description, InputSize, NetworkDescription, Overlay, Presence, Zoom};
 pub use graph::{Network, Node, Parameters, Source};

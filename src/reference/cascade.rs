@@ -1,4 +1,4 @@
-use super::{Gaze, Tensor, overlay, run, zoom, zoom_joints, zoom_overlay};
+use super::{Gaze, Tensor, kinematic_fit, overlay, run, zoom, zoom_joints, zoom_overlay};
 use crate::network::{Description, Model};
 
 /// The joint network's input, and where it looks from unless that is the canonical camera: the overlay of `image` and
@@ -22,8 +22,12 @@ pub fn joint_input(
 pub fn joints(model: &Model, image: &Tensor, mask: &Tensor) -> Option<Vec<f32>> {
     let (input, gaze) = joint_input(image, mask, &model.description);
     let joints = run(&model.joint_network, &input)?;
-    Some(match gaze {
+    let joints = match gaze {
         Some(gaze) => zoom_joints(joints.data(), &gaze),
         None => joints.data().to_vec(),
+    };
+    Some(match &model.description.arm {
+        Some(arm) => kinematic_fit(&joints, arm),
+        None => joints,
     })
 }

@@ -3,6 +3,7 @@ use std::fmt;
 use half::f16;
 
 use super::comparison::Comparison;
+use super::kinematic_fit;
 use super::random::Random;
 use super::stages::{self, Source};
 use super::zoom;
@@ -24,6 +25,7 @@ pub(super) enum Kernel {
     Rectify(Source),
     Overlay,
     Zoom(zoom::Part),
+    KinematicFit,
     Coverage,
     Estimate,
     Unrectify,
@@ -71,6 +73,7 @@ impl Kernel {
             Self::Zoom(zoom::Part::Camera),
             Self::Zoom(zoom::Part::Overlay),
             Self::Zoom(zoom::Part::Joints),
+            Self::KinematicFit,
             Self::Coverage,
             Self::Estimate,
             Self::Unrectify,
@@ -115,6 +118,7 @@ impl Kernel {
             Self::Rectify(source) => stages::rectify(device, layout, source, case).await,
             Self::Overlay => stages::overlay(device, layout, case).await,
             Self::Zoom(part) => zoom::compare(device, layout, part, case).await,
+            Self::KinematicFit => kinematic_fit::compare(device, layout, case).await,
             Self::Coverage => stages::coverage(device, layout, case).await,
             Self::Estimate => stages::estimate(device, layout, case).await,
             Self::Unrectify => stages::unrectify(device, layout, case).await,
@@ -248,6 +252,7 @@ impl Kernel {
             Self::Rectify(_)
             | Self::Overlay
             | Self::Zoom(_)
+            | Self::KinematicFit
             | Self::Coverage
             | Self::Estimate
             | Self::Unrectify => return Err(NetworkError::Empty),
@@ -294,6 +299,7 @@ impl fmt::Display for Kernel {
             Self::Zoom(zoom::Part::Camera) => "zoom",
             Self::Zoom(zoom::Part::Overlay) => "zoom_overlay",
             Self::Zoom(zoom::Part::Joints) => "zoom_joints",
+            Self::KinematicFit => "kinematic_fit",
             Self::Coverage => "coverage",
             Self::Estimate => "estimate",
             Self::Unrectify => "unrectify",

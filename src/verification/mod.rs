@@ -5,6 +5,7 @@
 mod cascade;
 mod comparison;
 mod kernel;
+mod kinematic_fit;
 mod random;
 mod report;
 mod stages;

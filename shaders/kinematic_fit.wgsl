@@ -1,0 +1,283 @@
+// Moves six joints to where an arm can have them: `reference::kinematic_fit`, in the same steps. A workgroup an image; each of
+// its first nine invocations brings forth a column of the errors' changes, or the errors themselves.
+
+override BODIES: u32;
+
+const JOINTS = 6u;
+const STEPS = 4u;
+const DAMPING = 0.01;
+// The place of the first joint, the turn about it, and those of forearm and wrist; behind their columns, the errors.
+const FREEDOMS = 8u;
+const COLUMNS = FREEDOMS + 1u;
+const NEAREST = 0.01;
+const LOWEST_COST = 3.4e38;
+
+struct Links {
+    shoulder_offset: f32,
+    upper_arm: f32,
+    elbow_offset: f32,
+    forearm: f32,
+    wrist_offset: f32,
+    wrist: f32,
+}
+
+struct Posture {
+    origin: vec3<f32>,
+    axis: vec3<f32>,
+    upper_arm: vec3<f32>,
+    forearm: vec3<f32>,
+    wrist: vec3<f32>,
+}
+
+// The links of each body, then `across` and `along`, row by row.
+@group(0) @binding(3) var<storage, read> arm: array<f32>;
+
+var<workgroup> seen: array<vec3<f32>, JOINTS>;
+var<workgroup> sight: vec3<f32>;
+var<workgroup> mean_depth: f32;
+var<workgroup> posture: Posture;
+var<workgroup> columns: array<array<vec4<f32>, JOINTS>, COLUMNS>;
+var<workgroup> rows: array<array<f32, COLUMNS>, FREEDOMS>;
+
+fn value(image: u32, channel: u32) -> f32 {
+    return input_at(channel / 4u * BATCH + image, 0u, 0u)[channel % 4u];
+}
+
+fn links_of(body: u32) -> Links {
+    let at = 6u * body;
+    return Links(arm[at], arm[at + 1u], arm[at + 2u], arm[at + 3u], arm[at + 4u], arm[at + 5u]);
+}
+
+fn weight(i: u32, j: u32) -> vec4<f32> {
+    let at = 6u * BODIES + JOINTS * i + j;
+    return vec4(vec3(arm[at]), arm[at + JOINTS * JOINTS]);
+}
+
+// A unit vector, or nothing of nothing.
+fn direction(vector: vec3<f32>) -> vec3<f32> {
+    return vector / max(length(vector), 1e-12);
+}
+
+fn turned(vector: vec3<f32>, turn: vec3<f32>) -> vec3<f32> {
+    let angle = length(turn);
+    let axis = turn / max(angle, 1e-12);
+    return vector * cos(angle) + cross(axis, vector) * sin(angle) + axis * (dot(axis, vector) * (1.0 - cos(angle)));
+}
+
+fn joint_of(posture: Posture, links: Links, joint: u32) -> vec3<f32> {
+    var place = posture.origin;
+    if joint >= 1u {
+        place += links.shoulder_offset * posture.axis;
+    }
+    if joint >= 2u {
+        place += links.upper_arm * posture.upper_arm + links.elbow_offset * posture.axis;
+    }
+    if joint >= 3u {
+        place += links.forearm * posture.forearm;
+    }
+    if joint >= 4u {
+        place += links.wrist_offset * posture.axis;
+    }
+    if joint >= 5u {
+        place += links.wrist * posture.wrist;
+    }
+    return place;
+}
+
+fn posture_near(links: Links) -> Posture {
+    let along = direction(links.shoulder_offset * (seen[1] - seen[0]) + links.wrist_offset * (seen[4] - seen[3]));
+    let upper_arm = seen[2] - seen[1] - links.elbow_offset * along;
+    let forearm = seen[3] - seen[2];
+    var across = cross(upper_arm, forearm) / max(length(upper_arm) * length(forearm), 1e-12);
+    if dot(across, along) < 0.0 {
+        across = -across;
+    }
+    let axis = direction(along + across);
+    let wrist = seen[5] - seen[4];
+    var near = Posture(
+        vec3(0.0),
+        axis,
+        direction(upper_arm - dot(upper_arm, axis) * axis),
+        direction(forearm - dot(forearm, axis) * axis),
+        direction(wrist - dot(wrist, axis) * axis),
+    );
+    var off = vec3(0.0);
+    for (var joint = 0u; joint < JOINTS; joint++) {
+        off += seen[joint] - joint_of(near, links, joint);
+    }
+    near.origin = off / f32(JOINTS);
+    return near;
+}
+
+fn depth_of(joint: vec3<f32>) -> f32 {
+    return max(dot(joint, sight), NEAREST);
+}
+
+// How far a joint is from where it is seen.
+fn error(links: Links, joint: u32) -> vec4<f32> {
+    let place = joint_of(posture, links, joint);
+    let depth = depth_of(place);
+    let seen_depth = depth_of(seen[joint]);
+    return vec4(mean_depth * (place / depth - seen[joint] / seen_depth), log(depth / seen_depth));
+}
+
+// How that changes with a freedom.
+fn change(links: Links, freedom: u32, joint: u32) -> vec4<f32> {
+    let place = joint_of(posture, links, joint);
+    var moved = vec3(0.0);
+    if freedom < 3u {
+        moved[freedom] = 1.0;
+    } else if freedom < 6u {
+        var unit = vec3(0.0);
+        unit[freedom - 3u] = 1.0;
+        moved = cross(unit, place - posture.origin);
+    } else if freedom == 6u && joint >= 3u {
+        moved = links.forearm * cross(posture.axis, posture.forearm);
+    } else if freedom == 7u && joint == 5u {
+        moved = links.wrist * cross(posture.axis, posture.wrist);
+    }
+    let depth = depth_of(place);
+    let nearer = dot(sight, moved) / depth;
+    return vec4(mean_depth / depth * (moved - nearer * place), nearer);
+}
+
+fn bring_forth(column: u32, links: Links) {
+    var values: array<vec4<f32>, JOINTS>;
+    for (var joint = 0u; joint < JOINTS; joint++) {
+        if column == FREEDOMS {
+            values[joint] = error(links, joint);
+        } else {
+            values[joint] = change(links, column, joint);
+        }
+    }
+    for (var i = 0u; i < JOINTS; i++) {
+        var sum = vec4(0.0);
+        for (var j = 0u; j < JOINTS; j++) {
+            sum += weight(i, j) * values[j];
+        }
+        columns[column][i] = sum;
+    }
+}
+
+fn product(a: u32, b: u32) -> f32 {
+    var sum = 0.0;
+    for (var joint = 0u; joint < JOINTS; joint++) {
+        sum += dot(columns[a][joint], columns[b][joint]);
+    }
+    return sum;
+}
+
+// The step by the normal equations in `rows`, by Gauss's elimination.
+fn solve() -> array<f32, FREEDOMS> {
+    for (var i = 0u; i < FREEDOMS; i++) {
+        for (var j = i + 1u; j < FREEDOMS; j++) {
+            let factor = rows[j][i] / rows[i][i];
+            for (var k = i; k < COLUMNS; k++) {
+                rows[j][k] -= factor * rows[i][k];
+            }
+        }
+    }
+    var solution: array<f32, FREEDOMS>;
+    for (var back = 0u; back < FREEDOMS; back++) {
+        let i = FREEDOMS - 1u - back;
+        var value = rows[i][FREEDOMS];
+        for (var j = i + 1u; j < FREEDOMS; j++) {
+            value -= rows[i][j] * solution[j];
+        }
+        solution[i] = value / rows[i][i];
+    }
+    return solution;
+}
+
+fn move_posture() {
+    let by = solve();
+    let turn = vec3(by[3], by[4], by[5]);
+    let axis = turned(posture.axis, turn);
+    posture.origin += vec3(by[0], by[1], by[2]);
+    posture.axis = axis;
+    posture.upper_arm = turned(posture.upper_arm, turn);
+    posture.forearm = turned(turned(posture.forearm, turn), by[6] * axis);
+    posture.wrist = turned(turned(posture.wrist, turn), by[7] * axis);
+}
+
+@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let image = group.y * groups.x + group.x;
+    if image >= BATCH {
+        return;
+    }
+    if lane == 0u {
+        var sum = vec3(0.0);
+        for (var joint = 0u; joint < JOINTS; joint++) {
+            seen[joint] = vec3(value(image, 3u * joint), value(image, 3u * joint + 1u), value(image, 3u * joint + 2u));
+            sum += seen[joint];
+        }
+        sight = direction(sum);
+    }
+    workgroupBarrier();
+    // Joints that are not numbers, or not in front of the camera, stay as they are.
+    var possible = true;
+    var depths = 0.0;
+    for (var joint = 0u; joint < JOINTS; joint++) {
+        let depth = dot(seen[joint], sight);
+        possible &= depth >= NEAREST && depth <= 1e6;
+        depths += depth;
+    }
+    if lane == 0u {
+        mean_depth = depths / f32(JOINTS);
+    }
+    var best: array<vec3<f32>, JOINTS>;
+    for (var joint = 0u; joint < JOINTS; joint++) {
+        best[joint] = seen[joint];
+    }
+    var least = LOWEST_COST;
+    for (var body = 0u; body < BODIES; body++) {
+        let links = links_of(body);
+        if lane == 0u {
+            posture = posture_near(links);
+        }
+        for (var iteration = 0u; iteration < STEPS; iteration++) {
+            workgroupBarrier();
+            if lane < COLUMNS {
+                bring_forth(lane, links);
+            }
+            workgroupBarrier();
+            for (var entry = lane; entry < FREEDOMS * COLUMNS; entry += 64u) {
+                let i = entry / COLUMNS;
+                let j = entry % COLUMNS;
+                let sum = product(i, j);
+                rows[i][j] = select(select(sum, -sum, j == FREEDOMS), (1.0 + DAMPING) * sum, i == j);
+            }
+            workgroupBarrier();
+            if lane == 0u {
+                move_posture();
+            }
+        }
+        if lane == 0u && possible {
+            bring_forth(FREEDOMS, links);
+            let cost = product(FREEDOMS, FREEDOMS);
+            if cost < least {
+                least = cost;
+                for (var joint = 0u; joint < JOINTS; joint++) {
+                    best[joint] = joint_of(posture, links, joint);
+                }
+            }
+        }
+    }
+    if lane == 0u {
+        for (var block = 0u; 4u * block < 3u * JOINTS; block++) {
+            var texel = vec4(0.0);
+            for (var part = 0u; part < 4u; part++) {
+                let channel = 4u * block + part;
+                if channel < 3u * JOINTS {
+                    texel[part] = best[channel / 3u][channel % 3u];
+                }
+            }
+            output_set(block * BATCH + image, 0u, 0u, texel);
+        }
+    }
+}
