@@ -25,7 +25,7 @@ impl Spread {
     }
 
     /// That of the shipped weights for a joint at `point`, camera optical frame: it grows with the distance, and is
-    /// larger along the ray (README, "No calibration rig").
+    /// larger along the ray (`docs/calibration.md`).
     pub fn at(point: DVec3) -> Self {
         let distance = point.length();
         Self {

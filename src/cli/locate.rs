@@ -31,8 +31,8 @@ pub struct Args {
     /// Images, and folders of images
     #[arg(required = true, value_name = "IMAGE|FOLDER")]
     inputs: Vec<PathBuf>,
-    /// The robot to find: its weights are looked for in the folder WHEREABOT_WEIGHTS, in ./weights, and
-    /// beside the program [default: ur5]
+    /// The robot to find: its weights are looked for in the folder WHEREABOT_WEIGHTS, in ./weights, and from
+    /// the program's folder in weights, ../weights, ../../weights and ../share/whereabot/weights [default: ur5]
     #[arg(long, value_name = "NAME", value_parser = weights::robot_name)]
     robot: Option<String>,
     /// The model file to use

@@ -34,7 +34,7 @@ def paper_mask_layers(dilations=(1, 2, 4, 8, 1), kernel=3):
 def context_mask_layers():
     """The context mask network: a wide view at a quarter of the resolution, upsampled, with two skips.
 
-    With a free camera the paper's mask network runs out of capacity: this one sees the whole image, for two thirds of
+    With a free camera the paper's mask network runs out of capacity: this one sees the whole image, for three fifths of
     the arithmetic.
     """
     def conv(name, source, channels, kernel=3, dilation=1, activation="relu"):
