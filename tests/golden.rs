@@ -11,13 +11,14 @@ use whereabot::gpu::{NetworkPlan, Precision};
 use whereabot::network::{Model, Network, Shape};
 use whereabot::reference;
 
-const NAMES: [&str; 6] = [
+const NAMES: [&str; 7] = [
     "tiny",
     "threshold",
     "tiny_f16",
     "context",
     "heatmap",
     "zoom",
+    "arm",
 ];
 
 fn file(name: &str) -> PathBuf {
@@ -126,6 +127,20 @@ fn the_overlay_agrees_with_pytorch() {
         assert!(difference(&reference::zoom_joints(&joints, &gaze), &expected).unwrap() <= 1e-5);
         assert!(difference(&joints, &expected).unwrap() > 1e-2);
     }
+}
+
+#[test]
+fn the_kinematic_fit_agrees_with_pytorch() {
+    let arm = model("arm").description.arm.unwrap();
+    let (seen, expected) = (golden("arm", "joint.dense"), golden("arm", "joints"));
+    let found = reference::kinematic_fit(&seen, &arm);
+    let difference_of = |joints: &[f32]| difference(joints, &expected).unwrap();
+    assert!(difference_of(&found) <= 1e-5, "{}", difference_of(&found));
+    // Negative controls: joints are moved, and by what they err along the line of sight.
+    assert!(difference_of(&seen) > 1e-2);
+    let mut other = arm.clone();
+    other.along = other.across;
+    assert!(difference_of(&reference::kinematic_fit(&seen, &other)) > 1e-3);
 }
 
 #[test]

@@ -64,7 +64,7 @@ class Case:
     def __init__(self, weights, images, folder):
         folder.mkdir(parents=True, exist_ok=True)
         self.weights, self.folder = folder / weights.name, folder
-        export.without_zoom(weights, self.weights)
+        export.networks_alone(weights, self.weights)
         self.onnx = folder / "cascade.onnx"
         self.description = export.export(self.weights, self.onnx)
         size = self.description["input"]

@@ -24,12 +24,14 @@ def read_model(path):
         return description, {key: file.get_tensor(key).astype(np.float32) for key in file.keys()}
 
 
-def without_zoom(path, copy):
-    """Copies a model file, but for what turns the joint network's camera: peers run the networks, which cost the same."""
+def networks_alone(path, copy):
+    """Copies a model file, but for what turns the joint network's camera and fits its joints to an arm: peers run the networks,
+    which cost the same."""
     with safe_open(path, framework="numpy") as file:
         metadata, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}
     description = json.loads(metadata["whereabot"])
-    description.pop("zoom", None)
+    for part in ("zoom", "arm"):
+        description.pop(part, None)
     save_file(tensors, copy, metadata | {"whereabot": json.dumps(description)})
 
 

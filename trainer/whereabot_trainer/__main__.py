@@ -144,6 +144,8 @@ def main(argv=None):
                          " choose the presence threshold")
     command.add_argument("--out", required=True, metavar="FILE")
     command.add_argument("--dtype", choices=("f32", "f16"), default="f32", help="of the tensors (%(default)s)")
+    command.add_argument("--no-fit", action="store_true", help="leave joints where the network puts them, instead of where an arm can"
+                         " have them")
     command.add_argument("--note", default="", metavar="TEXT", help="what the card is to say about the data")
     command.add_argument("--licence", default="MIT OR Apache-2.0", help="of the weights (%(default)s)")
     _machine_flags(command)

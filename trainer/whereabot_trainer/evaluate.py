@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from . import losses, zoom
+from . import kinematic_fit, losses, zoom
 from .networks import CAMERA, JOINTS, overlay
 
 BATCH = 8
@@ -97,9 +97,9 @@ def overlays(images, masks, rule, view, camera=CAMERA):
 
 
 @torch.no_grad()
-def joint_errors(network, metres, samples, numbers, estimated, rules, device):
-    """Distances [N, 6] in metres with the true masks, or with `estimated` ones; `rules` are the overlay's and the zoom's."""
-    errors = []
+def estimate_joints(network, metres, samples, numbers, estimated, rules, device):
+    """The joints [N, 6, 3] in metres with the true masks, or with `estimated` ones; `rules` are the overlay's and the zoom's."""
+    joints = []
     for batch in _batches(numbers):
         images, masks = samples.pixels(batch)
         if estimated is not None:
@@ -109,14 +109,21 @@ def joint_errors(network, metres, samples, numbers, estimated, rules, device):
         estimate = metres(network(seen.contiguous(memory_format=torch.channels_last)), arms)
         if cameras is not None:
             estimate = zoom.joints_of(estimate, *cameras)
-        truth = torch.from_numpy(samples.joints[batch])
-        errors.append(losses.joint_distances(estimate.cpu(), truth).numpy())
-    return np.concatenate(errors)
+        joints.append(estimate.cpu())
+    return torch.cat(joints)
 
 
-def score_joints(network, metres, samples, numbers, estimated, rules, device, name):
+def joint_errors(network, metres, samples, numbers, estimated, rules, device, arm=None):
+    """Distances [N, 6] in metres of those from the true joints, fitted to the `arm` where there is one."""
+    estimate = estimate_joints(network, metres, samples, numbers, estimated, rules, device)
+    if arm is not None:
+        estimate = kinematic_fit.fit(estimate, arm)
+    return losses.joint_distances(estimate, torch.from_numpy(samples.joints[numbers])).numpy()
+
+
+def score_joints(network, metres, samples, numbers, estimated, rules, device, name, arm=None):
     """Mean and median over samples of the error in centimetres, each sample's being the mean over its joints."""
-    each = 100 * joint_errors(network, metres, samples, numbers, estimated, rules, device).mean(1)
+    each = 100 * joint_errors(network, metres, samples, numbers, estimated, rules, device, arm).mean(1)
     return {f"{name}_mean_cm": round(float(each.mean()), 2), f"{name}_median_cm": round(float(np.median(each)), 2)}
 
 

@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from . import __version__, data, evaluate
+from . import __version__, data, evaluate, kinematic_fit
 from .model import describe, read_model, write_model
 from .train import load_mask, load_network, output_unit
 
+# From fewer samples the errors of six joints cannot be told.
+LEAST_LEARNED = 30
 SURE_THRESHOLDS = (0.7, 0.8, 0.9, 0.95, 0.97, 0.98)
 
 
@@ -102,16 +104,24 @@ def export_runs(args):
         presence = read_model(args.mask[-1])[2]["presence"]
         sure, least = presence["sure_threshold"], presence["min_sure"]
 
+    # How the joint network errs is measured where presence is chosen, on this robot.
+    learned = chosen[own[chosen] & seen[chosen]]
+    fitted_arm = None
+    if not args.no_fit and len(learned) >= LEAST_LEARNED:
+        estimates = evaluate.estimate_joints(
+            joint, evaluate.identity_metres, samples, learned, estimated, rules, args.device)
+        fitted_arm = kinematic_fit.arm_of(estimates.numpy(), samples.joints[learned])
+
     shown = reported[seen[reported]]
     measured = evaluate.score_mask(mask, samples, reported, args.device)
     figures = {name: measured[name] for name in ("accuracy", "iou", "precision", "recall")}
     for name, masks in (("true_mask", None), ("estimated_mask", estimated)):
         figures |= evaluate.score_joints(
-            joint, evaluate.identity_metres, samples, shown, masks, rules, args.device, name)
+            joint, evaluate.identity_metres, samples, shown, masks, rules, args.device, name, fitted_arm)
     found = shown[np.asarray(shares(shown, sure)) >= least]
     if len(found):
         figures |= evaluate.score_joints(
-            joint, evaluate.identity_metres, samples, found, estimated, rules, args.device, "found_estimated_mask")
+            joint, evaluate.identity_metres, samples, found, estimated, rules, args.device, "found_estimated_mask", fitted_arm)
     figures["presence"] = {}
     for part, numbers in (("chosen", chosen), ("reported", reported)):
         figures["presence"] |= {
@@ -131,7 +141,7 @@ def export_runs(args):
     }
     description = describe(
         mask.layers, joint.layers, family=mask_card["mask_training"]["family"], robot=robot, overlay=rules[0], zoom=rules[1],
-        presence={"mask_threshold": 0.5, "sure_threshold": sure, "min_sure": least}, card=card)
+        arm=fitted_arm, presence={"mask_threshold": 0.5, "sure_threshold": sure, "min_sure": least}, card=card)
     write_model(args.out, mask, joint, description, args.dtype)
     print(json.dumps({"chosen": description["presence"], "figures": figures}, indent=1))
     print(f"{args.out}: {os.path.getsize(args.out) / 1e6:.2f} MB")

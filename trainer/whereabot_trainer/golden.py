@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save_file
 
-from . import zoom
+from . import kinematic_fit, zoom
 from .evaluate import overlays
 from .model import describe, read_model, write_model
 from .networks import JOINT_INPUT, JOINTS, MASK_INPUT, Network
@@ -79,6 +79,14 @@ HEATMAP_LAYERS = [
     {"name": "dense", "op": "dense", "inputs": ["places"], "out_features": 3 * len(JOINTS), "activation": "none"},
     {"name": "joints", "op": "back_project", "inputs": ["dense"]},
 ]
+# A UR5 and a UR5e, and the joints of the first, a little off, in metres.
+ARM = {
+    "bodies": [dict(zip(kinematic_fit.LINKS, links, strict=True)) for links in (
+        (0.1358, 0.425, -0.1197, 0.3922, 0.093, 0.0946), (0.138, 0.425, -0.131, 0.3922, 0.1263, 0.0997))],
+    "across": [[80.0 if i == j else -12.0 if i < j else 0.0 for j in range(6)] for i in range(6)],
+    "along": [[60.0 if i == j else 5.0 * (j - i) if i < j else 0.0 for j in range(6)] for i in range(6)],
+}
+ARM_JOINTS = [0.02, 0.4, 1.5, 0.147, 0.389, 1.52, 0.031, 0.021, 1.37, 0.12, -0.352, 1.488, 0.222, -0.342, 1.49, 0.208, -0.37, 1.4]
 CARD = {"data": "none: random weights", "purpose": "golden files of whereabot's tests"}
 
 
@@ -123,12 +131,14 @@ def cascade_activations(mask, joint, description, image):
     joints = values[f"joint.{joint.layers[-1]['name']}"].clone()
     if cameras is not None:
         joints = zoom.joints_of(joints.reshape(1, -1, 3), *cameras).flatten()
+    if "arm" in description:
+        joints = kinematic_fit.fit(joints.reshape(1, -1, 3), description["arm"]).flatten()
     values["joints"] = joints
     return {name: value.contiguous() for name, value in values.items()}
 
 
 def write_golden(folder, seed=1):
-    """Writes the models `tiny`, `threshold`, `tiny_f16`, `context`, `heatmap` and `zoom` with their activations."""
+    """Writes the models `tiny`, `threshold`, `tiny_f16`, `context`, `heatmap`, `zoom` and `arm` with their activations."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     torch.use_deterministic_algorithms(True)
@@ -140,15 +150,20 @@ def write_golden(folder, seed=1):
     heatmap = (MASK_LAYERS, HEATMAP_LAYERS, WIDTH, HEIGHT)
     # The mask is spread over the whole small image: this looks at the middle half of it.
     view = {"spread": 2.0, "least": 0.5, "most": 4.0}
-    for name, family, (mask_layers, joint_layers, width, height), rule, view, dtype in (
-        ("tiny", "paper", paper, multiply, None, "f32"), ("threshold", "paper", paper, threshold, None, "f32"),
-        ("tiny_f16", "paper", paper, multiply, None, "f16"), ("context", "context", context, multiply, None, "f32"),
-        ("heatmap", "context", heatmap, multiply, None, "f32"), ("zoom", "context", heatmap, ramp, view, "f32"),
+    for name, family, (mask_layers, joint_layers, width, height), rule, view, arm, dtype in (
+        ("tiny", "paper", paper, multiply, None, None, "f32"), ("threshold", "paper", paper, threshold, None, None, "f32"),
+        ("tiny_f16", "paper", paper, multiply, None, None, "f16"), ("context", "context", context, multiply, None, None, "f32"),
+        ("heatmap", "context", heatmap, multiply, None, None, "f32"), ("zoom", "context", heatmap, ramp, view, None, "f32"),
+        ("arm", "paper", paper, multiply, None, ARM, "f32"),
     ):
         image = torch.rand((3, height, width), generator=torch.Generator().manual_seed(seed))
         mask, joint = _networks(seed, image, mask_layers, joint_layers)
+        if arm:
+            with torch.no_grad():
+                joint.dense.weight *= 0.02
+                joint.dense.bias[:] = torch.tensor(ARM_JOINTS)
         description = describe(
-            mask_layers, joint_layers, family=family, robot="golden", overlay=rule, zoom=view, width=width, height=height,
+            mask_layers, joint_layers, family=family, robot="golden", overlay=rule, zoom=view, arm=arm, width=width, height=height,
             camera={"fx": 14.25, "fy": 14.25, "cx": (width - 1) / 2, "cy": (height - 1) / 2},
             presence={"mask_threshold": 0.5, "sure_threshold": 0.7, "min_sure": 0.01}, card=CARD)
         path = folder / f"{name}.safetensors"

@@ -13,7 +13,7 @@ from .networks import CAMERA, INPUT_HEIGHT, INPUT_WIDTH, JOINT_INPUT, JOINTS, MA
 DTYPES = {"f32": torch.float32, "f16": torch.float16}
 
 
-def describe(mask_layers, joint_layers, *, family, robot, overlay, zoom, presence, card,
+def describe(mask_layers, joint_layers, *, family, robot, overlay, zoom, arm, presence, card,
              width=INPUT_WIDTH, height=INPUT_HEIGHT, camera=CAMERA):
     """The description that the engine reads from the model file."""
     return {
@@ -21,7 +21,7 @@ def describe(mask_layers, joint_layers, *, family, robot, overlay, zoom, presenc
         "input": {"width": width, "height": height}, "camera": camera,
         "mask_network": {"layers": mask_layers}, "overlay": overlay,
         **({"zoom": zoom} if zoom else {}),
-        "joint_network": {"layers": joint_layers}, "presence": presence, "card": card,
+        "joint_network": {"layers": joint_layers}, **({"arm": arm} if arm else {}), "presence": presence, "card": card,
     }
 
 

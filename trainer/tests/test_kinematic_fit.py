@@ -1,0 +1,81 @@
+import numpy as np
+import pytest
+import torch
+
+from whereabot_trainer import golden, kinematic_fit
+
+BODY, OTHER = golden.ARM["bodies"]
+
+
+def arms(body, count=200, seed=1):
+    """Joints [N, 6, 3] of random arms in front of a camera."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def unit():
+        return torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=1)
+
+    axis = unit()
+    upper, forearm, wrist = (
+        torch.nn.functional.normalize(link - (link * axis).sum(1, keepdim=True) * axis, dim=1) for link in (unit(), unit(), unit()))
+    first = torch.tensor([0.1, -0.2, 2.5], dtype=torch.float64) + 0.3 * unit()
+    return torch.stack([
+        first, body["shoulder_offset"] * axis, body["upper_arm"] * upper + body["elbow_offset"] * axis, body["forearm"] * forearm,
+        body["wrist_offset"] * axis, body["wrist"] * wrist], 1).cumsum(1)
+
+
+def off_by(joints, metres, seed=2):
+    noise = torch.randn(joints.shape, generator=torch.Generator().manual_seed(seed), dtype=joints.dtype)
+    return joints + metres * noise
+
+
+def mean_error(joints, truth):
+    return (joints - truth).norm(dim=2).mean().item()
+
+
+def test_the_bodies_among_joints_are_told():
+    found = kinematic_fit.bodies(torch.cat([arms(BODY), arms(OTHER)]).numpy())
+    assert found == [pytest.approx(BODY, abs=1e-5), pytest.approx(OTHER, abs=1e-5)]
+    # Joints of an arm of another kind have no such links.
+    bent = arms(BODY)
+    bent[:, 5] += 0.02
+    assert kinematic_fit.bodies(bent.numpy()) is None
+    assert kinematic_fit.arm_of(bent.numpy(), bent.numpy()) is None
+
+
+def test_the_fit_takes_out_what_no_arm_can_have():
+    truth = arms(BODY)
+    seen = off_by(truth, 0.015)
+    arm = kinematic_fit.arm_of(off_by(arms(BODY, seed=3), 0.015, seed=4).numpy(), arms(BODY, seed=3).numpy())
+    fitted = kinematic_fit.fit(seen, arm)
+    # Eight freedoms of eighteen.
+    assert mean_error(fitted, truth) < 0.75 * mean_error(seen, truth)
+    # Negative control: of another arm's links.
+    longer = arm | {"bodies": [BODY | {"forearm": 0.55}]}
+    assert mean_error(kinematic_fit.fit(seen, longer), truth) > mean_error(seen, truth)
+    links = kinematic_fit.links_of(fitted.numpy())
+    assert np.abs(links - [BODY[link] for link in kinematic_fit.LINKS]).max() < 1e-5
+
+
+def test_errors_that_go_together_are_learnt():
+    truth = arms(BODY, 400)
+    generator = torch.Generator().manual_seed(5)
+    # All of an arm as much too far away, and joints a little off.
+    farther = 1 + 0.05 * torch.randn(400, 1, 1, generator=generator, dtype=truth.dtype)
+    seen = off_by(truth, 0.005) * farther
+    arm = kinematic_fit.arm_of(seen.numpy(), truth.numpy())
+    alone = arm | {part: np.diag(np.diag(arm[part])).tolist() for part in ("across", "along")}
+    assert mean_error(kinematic_fit.fit(seen, arm), truth) < mean_error(kinematic_fit.fit(seen, alone), truth)
+
+
+def test_joints_that_cannot_be_stay_as_they_are():
+    seen = off_by(arms(BODY, 4), 0.02)
+    seen[0, 2, 1], seen[1, 3, 2] = torch.nan, -3.0
+    fitted = kinematic_fit.fit(seen, golden.ARM)
+    assert torch.equal(fitted[:2].nan_to_num(7), seen[:2].nan_to_num(7))
+    assert not torch.isclose(fitted[2:], seen[2:], atol=1e-4).all()
+
+
+def test_of_two_bodies_the_one_that_fits_is_taken():
+    for body in (BODY, OTHER):
+        truth = arms(body)
+        assert mean_error(kinematic_fit.fit(truth, golden.ARM), truth) < 1e-4
