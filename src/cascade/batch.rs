@@ -181,9 +181,7 @@ impl BatchLocator {
     /// # Errors
     /// A device that was lost: no submission on its way will be answered.
     pub fn finished(&mut self) -> Result<Option<Vec<Estimate>>, LocateError> {
-        // What went wrong, the check and the mappings say.
-        let _ = self.device.wgpu().poll(wgpu::PollType::Poll);
-        self.device.check()?;
+        self.device.poll(wgpu::PollType::Poll)?;
         let Some(mut flight) = self.in_flight.pop_front() else {
             return Ok(None);
         };

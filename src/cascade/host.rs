@@ -359,10 +359,8 @@ impl HostLocator {
     /// A device that was lost: no frame on its way will arrive.
     pub fn latest(&mut self) -> Result<Option<Located>, LocateError> {
         #[cfg(not(target_arch = "wasm32"))]
-        {
-            // What went wrong, the check below and the frames themselves say.
-            let _ = self.device.wgpu().poll(wgpu::PollType::Poll);
-        }
+        self.device.poll(wgpu::PollType::Poll)?;
+        #[cfg(target_arch = "wasm32")]
         self.device.check()?;
         let mut newest = None;
         for _ in 0..self.in_flight.len() {
@@ -457,19 +455,24 @@ mod poller {
     use crate::gpu::{Device, GpuError};
 
     /// The thread ends with it.
-    pub struct Poller(oneshot::Receiver<GpuError>);
+    pub struct Poller {
+        device: Arc<Device>,
+        failure: oneshot::Receiver<GpuError>,
+    }
 
     impl Poller {
         pub fn new(device: &Arc<Device>) -> Self {
-            let (sender, receiver) = oneshot::channel();
+            let (sender, failure) = oneshot::channel();
+            let poller = Self {
+                device: Arc::clone(device),
+                failure,
+            };
             let device = Arc::clone(device);
             std::thread::spawn(move || {
                 let start = Instant::now();
                 while !sender.is_canceled() {
-                    // What went wrong, the check says.
-                    let _ = device.wgpu().poll(wgpu::PollType::Poll);
                     let late = start.elapsed() > Device::TIMEOUT;
-                    let failure = device.check().err();
+                    let failure = device.poll(wgpu::PollType::Poll).err();
                     let failure = failure.or(late.then_some(GpuError::Timeout(Device::TIMEOUT)));
                     if let Some(failure) = failure {
                         // Nobody may be waiting any more.
@@ -479,14 +482,15 @@ mod poller {
                     std::thread::sleep(Duration::from_micros(200));
                 }
             });
-            Self(receiver)
+            poller
         }
 
         /// Ready when the device is lost, or time is up.
         pub fn poll_failure(&mut self, context: &mut Context<'_>) -> Poll<GpuError> {
-            Pin::new(&mut self.0)
-                .poll(context)
-                .map(|failure| failure.unwrap_or(GpuError::Timeout(Device::TIMEOUT)))
+            let ended = || GpuError::Lost("the thread that polls it ended".into());
+            Pin::new(&mut self.failure).poll(context).map(|failure| {
+                failure.unwrap_or_else(|_| self.device.check().err().unwrap_or_else(ended))
+            })
         }
     }
 }

@@ -335,15 +335,35 @@ impl Device {
     /// [`GpuError::Timeout`] after [`Device::TIMEOUT`], and any fault of the device.
     #[cfg(not(target_arch = "wasm32"))]
     pub fn wait(&self) -> Result<(), GpuError> {
-        let polled = self.device.poll(wgpu::PollType::Wait {
+        self.poll(wgpu::PollType::Wait {
             submission_index: None,
             timeout: Some(Self::TIMEOUT),
-        });
+        })
+    }
+
+    /// Polls the device, or waits for it.
+    ///
+    /// # Errors
+    /// As [`Device::wait`].
+    #[cfg(not(target_arch = "wasm32"))]
+    pub(crate) fn poll(&self, poll: wgpu::PollType) -> Result<(), GpuError> {
+        self.survive(|| self.device.poll(poll))
+    }
+
+    /// wgpu panics where the driver says to whoever polls that the device is lost.
+    #[cfg(not(target_arch = "wasm32"))]
+    fn survive(
+        &self,
+        poll: impl FnOnce() -> Result<wgpu::PollStatus, wgpu::PollError>,
+    ) -> Result<(), GpuError> {
+        self.check()?;
+        let polled = std::panic::catch_unwind(std::panic::AssertUnwindSafe(poll));
         self.check()?;
         match polled {
-            Ok(_) => Ok(()),
-            Err(wgpu::PollError::Timeout) => Err(GpuError::Timeout(Self::TIMEOUT)),
-            Err(other) => Err(GpuError::Lost(other.to_string())),
+            Ok(Ok(_)) => Ok(()),
+            Ok(Err(wgpu::PollError::Timeout)) => Err(GpuError::Timeout(Self::TIMEOUT)),
+            Ok(Err(other)) => Err(GpuError::Lost(other.to_string())),
+            Err(_) => Err(GpuError::Lost("polling it panicked".into())),
         }
     }
 
@@ -423,5 +443,38 @@ fn convert(error: wgpu::Error) -> GpuError {
         wgpu::Error::OutOfMemory { source } => GpuError::OutOfMemory(source.to_string()),
         wgpu::Error::Validation { description, .. } => GpuError::Validation(description),
         wgpu::Error::Internal { description, .. } => GpuError::Driver(description),
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::panic)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_loss_that_makes_wgpu_panic_is_an_error() {
+        let device = Device::open(&AdapterRequest::new(None, None)).unwrap();
+        let is_lost = |result| matches!(result, Err(GpuError::Lost(_)));
+        // Negative control: a sound device is polled.
+        device
+            .survive(|| device.device.poll(wgpu::PollType::Poll))
+            .unwrap();
+        // As wgpu does it: it tells the loss, then it panics.
+        let fatal = || {
+            device.device.destroy();
+            let _ = device.device.poll(wgpu::PollType::Poll);
+            panic!("Error in Device::poll: Parent device is lost")
+        };
+        assert!(is_lost(device.survive(fatal)));
+        // A device that is known to be lost is not polled again.
+        let mut polled = false;
+        let again = device.survive(|| {
+            polled = true;
+            device.device.poll(wgpu::PollType::Poll)
+        });
+        assert!(is_lost(again) && !polled);
+        // Where the loss was not told, the panic tells.
+        let device = Device::open(&AdapterRequest::new(None, None)).unwrap();
+        assert!(is_lost(device.survive(|| panic!("unknown"))));
     }
 }
