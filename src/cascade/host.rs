@@ -141,7 +141,7 @@ impl HostLocator {
     /// in [`HostLocator::warm_up`].
     ///
     /// # Errors
-    /// A layer that exceeds the device's limits, or a driver's refusal.
+    /// A batch of none, a layer that exceeds the device's limits, or a driver's refusal.
     pub fn new(
         device: Arc<Device>,
         model: &Model,
@@ -204,8 +204,8 @@ impl HostLocator {
     ///
     /// # Errors
     /// An index beyond the batch; a texture of another format, size or usage than what can be read; a camera
-    /// of another size than the image; a crop beyond it: the former source stays then. Too little memory for
-    /// a mask texture of the new size: then the new source is searched, and the mask keeps its former size.
+    /// of another size than the image; a crop beyond it; too little memory for a mask texture of the new size. The
+    /// former source stays then.
     pub fn set_source(&mut self, index: usize, source: &Source) -> Result<(), LocateError> {
         self.device.check()?;
         let [width, height] = source.planes.size();
@@ -225,6 +225,16 @@ impl HostLocator {
         let last = self.views.get(index).copied().flatten();
         let size = crop.turned(source.orientation);
         let view = View::of(last, camera, size, texels, &self.description)?;
+        // What may fail comes first: then nothing is changed.
+        let mask = if last != Some(view) && self.mask == MaskSize::Source {
+            let canonical = &self.description.camera;
+            let params = Unrectification::new(camera, canonical, crop, source.orientation);
+            let (device, plan) = (&self.device, &self.plan);
+            let resized = self.outputs.resized_mask(device, plan, index, &params)?;
+            Some((params, resized))
+        } else {
+            None
+        };
         self.plan
             .bind(&self.device, index, &source.planes, &view.rectification)?;
         if let Some(place) = self.views.get_mut(index) {
@@ -233,12 +243,9 @@ impl HostLocator {
         if last != Some(view) {
             let max_radius = view.rectification.max_radius;
             self.outputs.set_max_radius(&self.device, index, max_radius);
-            if self.mask == MaskSize::Source {
-                let canonical = &self.description.camera;
-                let params = Unrectification::new(camera, canonical, crop, source.orientation);
-                self.outputs
-                    .set_mask(&self.device, &self.plan, index, params)?;
-            }
+        }
+        if let Some((params, resized)) = mask {
+            self.outputs.set_mask(&self.device, index, &params, resized);
         }
         Ok(())
     }
@@ -259,7 +266,7 @@ impl HostLocator {
     }
 
     /// The mask of image `index`, a texture of `r8unorm` with the usages `TEXTURE_BINDING` and `COPY_SRC`;
-    /// `None` beyond the batch. Another one after [`HostLocator::set_source`] gave it another size.
+    /// `None` beyond the batch. Another one after [`HostLocator::set_source`] gave it another size, and only then.
     pub fn mask(&self, index: usize) -> Option<&wgpu::TextureView> {
         self.outputs.masks().get(index).map(|mask| mask.view())
     }
@@ -353,46 +360,54 @@ impl HostLocator {
         Ok(())
     }
 
-    /// The newest results that arrived since the last call, if any did. Never waits; polls the device.
+    /// The newest results that arrived since the last call, if any did. A frame that did not run, as its encoder was dropped or
+    /// the submission refused, has none. Never waits; polls the device.
     ///
     /// # Errors
     /// A device that was lost: no frame on its way will arrive.
     pub fn latest(&mut self) -> Result<Option<Located>, LocateError> {
         #[cfg(not(target_arch = "wasm32"))]
-        {
-            // What went wrong, the check below and the frames themselves say.
-            let _ = self.device.wgpu().poll(wgpu::PollType::Poll);
-        }
+        self.device.poll(wgpu::PollType::Poll)?;
+        #[cfg(target_arch = "wasm32")]
         self.device.check()?;
-        let mut newest = None;
+        let (mut newest, mut failure) = (None, None);
         for _ in 0..self.in_flight.len() {
             let Some(mut flight) = self.in_flight.pop_front() else {
                 break;
             };
-            match flight.mapping.state() {
+            let state = flight.mapping.state();
+            if state == Mapped::Pending {
+                self.in_flight.push_back(flight);
+                continue;
+            }
+            let Flight { slot, frame, .. } = flight;
+            let frames = match state {
+                Mapped::Ready => mapped(&slot.results, |bytes| self.plan.frames_in(bytes)),
                 Mapped::Failed => {
                     let lost = "a frame's results will not arrive".to_owned();
-                    return Err(GpuError::Lost(lost).into());
-                }
-                Mapped::Pending => {
-                    self.in_flight.push_back(flight);
-                    continue;
+                    Err(GpuError::Lost(lost))
                 }
                 // Its encoder was dropped.
-                Mapped::Never => {}
-                Mapped::Ready => {
-                    let frames = mapped(&flight.slot.results, |bytes| self.plan.frames_in(bytes))?;
-                    let estimates = frames.into_iter().zip(&flight.slot.views);
+                Mapped::Never | Mapped::Pending => Ok(None),
+            };
+            match frames {
+                Ok(Some(frames)) => {
+                    let estimates = frames.into_iter().zip(&slot.views);
                     let estimates = estimates.map(|(frame, view)| {
                         Estimate::new(&self.description, frame, view, Output::default())
                     });
                     newest = Some(Located {
-                        frame: flight.frame,
+                        frame,
                         estimates: estimates.collect(),
                     });
                 }
+                Ok(None) => {}
+                Err(error) => failure = Some(error),
             }
-            self.idle.push(flight.slot);
+            self.idle.push(slot);
+        }
+        if let Some(failure) = failure {
+            return Err(failure.into());
         }
         Ok(newest)
     }
@@ -457,19 +472,24 @@ mod poller {
     use crate::gpu::{Device, GpuError};
 
     /// The thread ends with it.
-    pub struct Poller(oneshot::Receiver<GpuError>);
+    pub struct Poller {
+        device: Arc<Device>,
+        failure: oneshot::Receiver<GpuError>,
+    }
 
     impl Poller {
         pub fn new(device: &Arc<Device>) -> Self {
-            let (sender, receiver) = oneshot::channel();
+            let (sender, failure) = oneshot::channel();
+            let poller = Self {
+                device: Arc::clone(device),
+                failure,
+            };
             let device = Arc::clone(device);
             std::thread::spawn(move || {
                 let start = Instant::now();
                 while !sender.is_canceled() {
-                    // What went wrong, the check says.
-                    let _ = device.wgpu().poll(wgpu::PollType::Poll);
                     let late = start.elapsed() > Device::TIMEOUT;
-                    let failure = device.check().err();
+                    let failure = device.poll(wgpu::PollType::Poll).err();
                     let failure = failure.or(late.then_some(GpuError::Timeout(Device::TIMEOUT)));
                     if let Some(failure) = failure {
                         // Nobody may be waiting any more.
@@ -479,14 +499,15 @@ mod poller {
                     std::thread::sleep(Duration::from_micros(200));
                 }
             });
-            Self(receiver)
+            poller
         }
 
         /// Ready when the device is lost, or time is up.
         pub fn poll_failure(&mut self, context: &mut Context<'_>) -> Poll<GpuError> {
-            Pin::new(&mut self.0)
-                .poll(context)
-                .map(|failure| failure.unwrap_or(GpuError::Timeout(Device::TIMEOUT)))
+            let ended = || GpuError::Lost("the thread that polls it ended".into());
+            Pin::new(&mut self.failure).poll(context).map(|failure| {
+                failure.unwrap_or_else(|_| self.device.check().err().unwrap_or_else(ended))
+            })
         }
     }
 }

@@ -112,7 +112,7 @@ impl Device {
         device.set_device_lost_callback(move |reason, message| {
             lost(GpuError::Lost(format!("{reason:?}: {message}")));
         });
-        let pipelines = Pipelines::new(&device, &[]);
+        let pipelines = Pipelines::new(&device);
         Ok(Self {
             tier,
             halves: adapter
@@ -149,7 +149,7 @@ impl Device {
             choice: None,
             fault: Arc::default(),
             loss: Some(Loss::new(&device)),
-            pipelines: Pipelines::new(&device, &[]),
+            pipelines: Pipelines::new(&device),
             device,
             queue,
         };
@@ -239,9 +239,15 @@ impl Device {
     /// process; what is of another adapter, driver or version, damaged, or no such thing at all, is passed
     /// over. Without effect where the backend has no such cache, or a host did not enable
     /// `PIPELINE_CACHE`.
+    ///
+    /// # Safety
+    /// `memory` comes from where nobody puts what was made to look like a cache: the checksum tells damage, not intent,
+    /// and a driver may run what it finds.
     #[must_use]
-    pub fn with_pipeline_cache(mut self, memory: &[u8]) -> Self {
-        self.pipelines = Pipelines::new(&self.device, memory);
+    #[allow(unsafe_code)]
+    pub unsafe fn with_pipeline_cache(mut self, memory: &[u8]) -> Self {
+        // SAFETY: the caller answers for `memory`.
+        self.pipelines = unsafe { Pipelines::with(&self.device, memory) };
         self
     }
 
@@ -256,7 +262,10 @@ impl Device {
         &self.tuner
     }
 
-    /// The pipeline of a kernel. Driver errors reach the caller's [`Device::scoped`].
+    /// The pipeline of a kernel.
+    ///
+    /// # Errors
+    /// A kernel that the driver does not compile, or too little memory.
     pub(super) fn pipeline(
         &self,
         label: &str,
@@ -264,9 +273,9 @@ impl Device {
         entry_point: &str,
         constants: &[(&str, f64)],
         checks: Checks,
-    ) -> wgpu::ComputePipeline {
+    ) -> Result<wgpu::ComputePipeline, GpuError> {
         self.pipelines
-            .get(&self.device, label, text, entry_point, constants, checks)
+            .get(self, label, text, entry_point, constants, checks)
     }
 
     /// Gives the first fault that happened since the device was opened.
@@ -335,15 +344,35 @@ impl Device {
     /// [`GpuError::Timeout`] after [`Device::TIMEOUT`], and any fault of the device.
     #[cfg(not(target_arch = "wasm32"))]
     pub fn wait(&self) -> Result<(), GpuError> {
-        let polled = self.device.poll(wgpu::PollType::Wait {
+        self.poll(wgpu::PollType::Wait {
             submission_index: None,
             timeout: Some(Self::TIMEOUT),
-        });
+        })
+    }
+
+    /// Polls the device, or waits for it.
+    ///
+    /// # Errors
+    /// As [`Device::wait`].
+    #[cfg(not(target_arch = "wasm32"))]
+    pub(crate) fn poll(&self, poll: wgpu::PollType) -> Result<(), GpuError> {
+        self.survive(|| self.device.poll(poll))
+    }
+
+    /// wgpu panics where the driver says to whoever polls that the device is lost.
+    #[cfg(not(target_arch = "wasm32"))]
+    fn survive(
+        &self,
+        poll: impl FnOnce() -> Result<wgpu::PollStatus, wgpu::PollError>,
+    ) -> Result<(), GpuError> {
+        self.check()?;
+        let polled = std::panic::catch_unwind(std::panic::AssertUnwindSafe(poll));
         self.check()?;
         match polled {
-            Ok(_) => Ok(()),
-            Err(wgpu::PollError::Timeout) => Err(GpuError::Timeout(Self::TIMEOUT)),
-            Err(other) => Err(GpuError::Lost(other.to_string())),
+            Ok(Ok(_)) => Ok(()),
+            Ok(Err(wgpu::PollError::Timeout)) => Err(GpuError::Timeout(Self::TIMEOUT)),
+            Ok(Err(other)) => Err(GpuError::Lost(other.to_string())),
+            Err(_) => Err(GpuError::Lost("polling it panicked".into())),
         }
     }
 
@@ -376,7 +405,7 @@ impl Device {
         pollster::block_on(self.read_async(buffer, read))
     }
 
-    /// As [`Device::read`]: in a browser without blocking, elsewhere blocking all the same.
+    /// As [`Device::read`]: in a browser without blocking, elsewhere blocking all the same. May be dropped before it is done.
     ///
     /// # Errors
     /// Those.
@@ -387,6 +416,7 @@ impl Device {
     ) -> Result<T, GpuError> {
         let (mapping, callback) = Mapping::new();
         buffer.map_async(wgpu::MapMode::Read, .., callback);
+        let pending = Pending(buffer);
         let done = async {
             #[cfg(not(target_arch = "wasm32"))]
             self.wait()?;
@@ -395,12 +425,21 @@ impl Device {
             self.check()
         };
         let done = done.await;
-        if let Err(GpuError::Timeout(_)) = done {
-            // It would be mapped later, and what is written to it then be refused.
-            buffer.unmap();
+        if !matches!(done, Err(GpuError::Timeout(_))) {
+            std::mem::forget(pending);
         }
         done?;
         mapped(buffer, read)
+    }
+}
+
+/// A buffer that is to be mapped, for somebody who may stop waiting: it would be mapped later, and what is written to it
+/// then be refused.
+struct Pending<'a>(&'a wgpu::Buffer);
+
+impl Drop for Pending<'_> {
+    fn drop(&mut self) {
+        self.0.unmap();
     }
 }
 
@@ -423,5 +462,65 @@ fn convert(error: wgpu::Error) -> GpuError {
         wgpu::Error::OutOfMemory { source } => GpuError::OutOfMemory(source.to_string()),
         wgpu::Error::Validation { description, .. } => GpuError::Validation(description),
         wgpu::Error::Internal { description, .. } => GpuError::Driver(description),
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, clippy::panic)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_loss_that_makes_wgpu_panic_is_an_error() {
+        let device = Device::open(&AdapterRequest::new(None, None)).unwrap();
+        let is_lost = |result| matches!(result, Err(GpuError::Lost(_)));
+        // Negative control: a sound device is polled.
+        device
+            .survive(|| device.device.poll(wgpu::PollType::Poll))
+            .unwrap();
+        // As wgpu does it: it tells the loss, then it panics.
+        let fatal = || {
+            device.device.destroy();
+            let _ = device.device.poll(wgpu::PollType::Poll);
+            panic!("Error in Device::poll: Parent device is lost")
+        };
+        assert!(is_lost(device.survive(fatal)));
+        // A device that is known to be lost is not polled again.
+        let mut polled = false;
+        let again = device.survive(|| {
+            polled = true;
+            device.device.poll(wgpu::PollType::Poll)
+        });
+        assert!(is_lost(again) && !polled);
+        // Where the loss was not told, the panic tells.
+        let device = Device::open(&AdapterRequest::new(None, None)).unwrap();
+        assert!(is_lost(device.survive(|| panic!("unknown"))));
+    }
+
+    #[test]
+    fn a_buffer_that_nobody_waits_for_is_written_again() {
+        let device = Device::open(&AdapterRequest::new(None, None)).unwrap();
+        let buffer = super::super::tensor::staging_buffer(&device, 1 << 16);
+        let submit = || {
+            let mut encoder = device.device.create_command_encoder(&Default::default());
+            encoder.clear_buffer(&buffer, 0, None);
+            device.queue.submit([encoder.finish()]);
+        };
+        let map = || buffer.map_async(wgpu::MapMode::Read, .., |_| ());
+        for done in [false, true] {
+            submit();
+            map();
+            let pending = Pending(&buffer);
+            if done {
+                device.wait().unwrap();
+            }
+            drop(pending);
+        }
+        submit();
+        device.read(&buffer, |_| ()).unwrap();
+        // Negative control: one that is still to be mapped.
+        map();
+        submit();
+        assert!(matches!(device.check(), Err(GpuError::Validation(_))));
     }
 }

@@ -25,10 +25,10 @@ pub struct Work {
 
 impl Work {
     /// Reads or writes each of `tensors` and `parameters` values, and does so many `multiply_adds`.
-    pub(super) fn new(tensors: Tensors<'_>, parameters: usize, multiply_adds: usize) -> Self {
+    pub(super) fn new(tensors: Tensors<'_>, parameters: usize, multiply_adds: u64) -> Self {
         let activations: u64 = tensors.named().map(|(.., tensor)| tensor.bytes()).sum();
         Self {
-            operations: 2 * multiply_adds as u64,
+            operations: 2 * multiply_adds,
             bytes: activations + 4 * parameters as u64,
         }
     }
@@ -157,7 +157,7 @@ impl Step {
             .chain(step.constants.iter().copied())
             .collect();
         let text = kernel_text(step.tensors.layout(), step.sizes, step.source);
-        let pipeline = device.pipeline(step.label, text, step.entry_point, &constants, checks);
+        let pipeline = device.pipeline(step.label, text, step.entry_point, &constants, checks)?;
         let bind_group = bind(device, &pipeline, step.tensors, step.bindings);
         // A dimension holds 65,535 workgroups at most: long dispatches are folded into rows.
         let row = device.wgpu().limits().max_compute_workgroups_per_dimension as usize;

@@ -296,7 +296,8 @@ pub(super) async fn coverage(
         let size = (batch * size_of::<Totals>()) as u64;
         let totals = buffer(device, size, STORAGE);
         let readback = buffer(device, size, BufferUsages::MAP_READ);
-        let step = gpu::coverage(device, &tensor, &totals, THRESHOLDS)?;
+        let runs = buffer(device, 4, STORAGE);
+        let step = gpu::coverage(device, &tensor, &totals, &runs, THRESHOLDS)?;
         Ok((totals, readback, step))
     })?;
     let (width, height) = (shape.width as u32, shape.height as u32);
@@ -459,7 +460,7 @@ pub(super) async fn unrectify(
     let tensor = Tensor::in_layout(device, layout, "mask", shape, batch, 0)?;
     let row = side.next_multiple_of(wgpu::COPY_BYTES_PER_ROW_ALIGNMENT);
     let (unrectify, readback) = device.scoped(|| {
-        let unrectify = Unrectify::new(device, &tensor, 0, params.clone())?;
+        let unrectify = Unrectify::new(device, &tensor, 0, &params)?;
         let size = u64::from(row) * u64::from(side);
         Ok((unrectify, buffer(device, size, BufferUsages::MAP_READ)))
     })?;
