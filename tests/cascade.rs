@@ -8,7 +8,7 @@ use image::RgbaImage;
 use whereabot::camera::{Camera, Rectification};
 use whereabot::cascade::{
     BatchImage, BatchLocator, BatchOptions, Estimate, HostLocator, HostOptions, LocateError,
-    Locator, Output, Status,
+    Locator, Mask, Output, Status,
 };
 use whereabot::gpu::{Frame, GpuError, Plan, Precision};
 use whereabot::network::{Layer, Model, Network, Operation};
@@ -271,6 +271,39 @@ fn a_zoomed_joint_network_sees_something_else() {
     });
     assert_eq!(mask(&plain), mask(&zoomed));
     assert!(difference(&joints(&plain), &joints(&zoomed)).unwrap() > 1e-3);
+}
+
+#[test]
+fn joints_are_where_the_arm_can_have_them() {
+    let file = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/tests/data/golden/arm.safetensors"
+    );
+    let model = Model::load(file).unwrap();
+    let mut loose = model.clone();
+    loose.description.arm = None;
+    let image = picture(80, 56, 3);
+    let camera = Camera::from_hfov(80, 56, 1.2);
+    let mask = Mask {
+        width: 20,
+        height: 14,
+        probability: vec![0.9; 280],
+    };
+    let joints = |mut locator: Locator| -> Vec<f32> {
+        let joints = locator.joints_with_mask(&image, &camera, &mask).unwrap();
+        joints.iter().flatten().map(|v| *v as f32).collect()
+    };
+    let on_gpu = |model: &Model| joints(Locator::on_gpu(device(), model, Precision::F32).unwrap());
+    let (gpu, cpu) = (on_gpu(&model), joints(Locator::on_cpu(&model)));
+    assert!(difference(&gpu, &cpu).unwrap() <= 1e-4);
+    // The forearm is as long as a UR5's.
+    let forearm = |joints: &[f32]| {
+        let joint = |i: usize| glam::Vec3::from_slice(&joints[3 * i..]);
+        joint(2).distance(joint(3))
+    };
+    assert!((forearm(&gpu) - 0.3922).abs() < 1e-4);
+    // Negative control: where the network puts them it is not.
+    assert!((forearm(&on_gpu(&loose)) - 0.3922).abs() > 1e-3);
 }
 
 #[test]

@@ -137,7 +137,7 @@ fn a_file_of_another_network_is_refused() {
 #[test]
 fn descriptions_that_mean_something_else_are_refused() {
     type Change = fn(&mut Value);
-    let changes: [(Change, &[&str]); 19] = [
+    let changes: [(Change, &[&str]); 24] = [
         (
             |d| d["version"] = json!(2),
             &["version: expected 1, found 2"],
@@ -192,6 +192,32 @@ fn descriptions_that_mean_something_else_are_refused() {
             |d| d["zoom"] = json!({"spread": 5, "least": 0.5}),
             &["most"],
         ),
+        (
+            |d| {
+                d["arm"] = arm();
+                d["joints"] = json!(["elbow"]);
+            },
+            &["arm", "6 joints", "found 1"],
+        ),
+        (
+            |d| d["arm"] = with(arm(), "bodies", json!([])),
+            &["arm.bodies", "found none"],
+        ),
+        (
+            |d| {
+                d["arm"] = arm();
+                d["arm"]["bodies"][0]["forearm"] = json!(0);
+            },
+            &["arm.bodies", "0.001 to 100 m", "forearm: 0.0"],
+        ),
+        (
+            |d| {
+                d["arm"] = arm();
+                d["arm"]["along"][5][5] = json!(1e30);
+            },
+            &["arm.along", "a million"],
+        ),
+        (|d| d["arm"] = with(arm(), "across", json!([[1.0]])), &["6"]),
         (|d| d["input"]["width"] = json!(0), &["input", "0 x 16"]),
         (
             |d| d["input"]["width"] = json!(4_000_000_000_u32),
@@ -206,6 +232,34 @@ fn descriptions_that_mean_something_else_are_refused() {
     for (change, parts) in changes {
         assert_says(&with_description(change), parts);
     }
+}
+
+/// Of a UR5, whose joint network errs by a centimetre.
+fn arm() -> Value {
+    let whitening: Vec<[f32; 6]> = (0..6)
+        .map(|i| std::array::from_fn(|j| if i == j { 100.0 } else { 0.0 }))
+        .collect();
+    json!({
+        "bodies": [{"shoulder_offset": 0.1358, "upper_arm": 0.425, "elbow_offset": -0.1197, "forearm": 0.3922,
+            "wrist_offset": 0.093, "wrist": 0.0946}],
+        "across": whitening, "along": whitening,
+    })
+}
+
+fn with(mut object: Value, key: &str, value: Value) -> Value {
+    object[key] = value;
+    object
+}
+
+#[test]
+fn an_arm_is_read() {
+    let description = with(small(), "arm", arm());
+    let model = Model::from_bytes(&model_file(&description, 1), "model").unwrap();
+    let arm = model.description.arm.unwrap();
+    assert_eq!(
+        (arm.bodies[0].forearm, arm.across[5][5], arm.along[0][1]),
+        (0.3922, 100.0, 0.0)
+    );
 }
 
 #[test]
