@@ -1,5 +1,6 @@
 // Counts and bounds the pixels of each mask that reach THRESHOLD, and counts those that reach
 // SURE_THRESHOLD and those that are not finite. A workgroup reduces its 256 pixels, then adds them to its image's totals.
+// Counts its own runs too: it is the last of a frame's kernels.
 
 override THRESHOLD: f32;
 override SURE_THRESHOLD: f32;
@@ -21,6 +22,7 @@ struct Totals {
 
 // [image], cleared before
 @group(0) @binding(3) var<storage, read_write> totals: array<Totals>;
+@group(0) @binding(4) var<storage, read_write> runs: u32;
 
 var<workgroup> pixels: atomic<u32>;
 var<workgroup> sure: atomic<u32>;
@@ -59,6 +61,9 @@ fn main(
         }
     }
     workgroupBarrier();
+    if group_index == 0u && local == 0u {
+        runs += 1u;
+    }
     if local == 0u && image < BATCH {
         atomicAdd(&totals[image].not_finite, atomicLoad(&not_finite));
         atomicAdd(&totals[image].sure, atomicLoad(&sure));

@@ -23,7 +23,7 @@ fn run(mask: &[f32], height: usize, width: usize, batch: usize, threshold: f32) 
     let tensor = Tensor::in_layout(&device, layout, "mask", shape, batch, 0).unwrap();
     tensor.write(&device, mask).unwrap();
     let size = (batch * size_of::<Totals>()) as u64;
-    let buffer = |usage| {
+    let buffer = |size, usage| {
         device.wgpu().create_buffer(&wgpu::BufferDescriptor {
             label: None,
             size,
@@ -32,19 +32,25 @@ fn run(mask: &[f32], height: usize, width: usize, batch: usize, threshold: f32) 
         })
     };
     use wgpu::BufferUsages as U;
-    let totals = buffer(U::STORAGE | U::COPY_SRC | U::COPY_DST);
-    let readback = buffer(U::MAP_READ | U::COPY_DST);
+    let totals = buffer(size, U::STORAGE | U::COPY_SRC | U::COPY_DST);
+    let runs = buffer(4, U::STORAGE | U::COPY_SRC);
+    let readback = buffer(size + 4, U::MAP_READ | U::COPY_DST);
     let step = device
-        .scoped(|| coverage(&device, &tensor, &totals, (threshold, SURE)))
+        .scoped(|| coverage(&device, &tensor, &totals, &runs, (threshold, SURE)))
         .unwrap();
     let mut encoder = device.wgpu().create_command_encoder(&Default::default());
-    encoder.clear_buffer(&totals, 0, None);
-    step.encode(&mut encoder.begin_compute_pass(&Default::default()));
+    for _ in 0..2 {
+        encoder.clear_buffer(&totals, 0, None);
+        step.encode(&mut encoder.begin_compute_pass(&Default::default()));
+    }
     encoder.copy_buffer_to_buffer(&totals, 0, &readback, 0, size);
+    encoder.copy_buffer_to_buffer(&runs, 0, &readback, size, 4);
     device.queue().submit([encoder.finish()]);
     device
         .read(&readback, |bytes| {
-            bytemuck::pod_collect_to_vec::<u8, Totals>(bytes)
+            let (totals, runs) = bytes.split_at(size as usize);
+            assert_eq!(runs, 2_u32.to_le_bytes());
+            bytemuck::pod_collect_to_vec::<u8, Totals>(totals)
         })
         .unwrap()
         .iter()

@@ -572,6 +572,42 @@ fn several_frames_are_in_flight_and_the_newest_counts() {
 }
 
 #[test]
+fn a_frame_that_did_not_run_has_no_results() {
+    let (host, model) = (Host::new(), model());
+    let mut locator = host.locator(&model);
+    let source = |seed| Source::new(host.rgba(&picture(seed)), camera(WIDTH, HEIGHT));
+    locator.set_source(0, &source(1)).unwrap();
+    host.run(&mut locator);
+    locator.set_source(0, &source(2)).unwrap();
+    for (frame, runs, is_refused) in [(2, true, true), (3, false, false), (4, true, false)] {
+        let scope = host.device.push_error_scope(wgpu::ErrorFilter::Validation);
+        let mut encoder = host.device.create_command_encoder(&Default::default());
+        if runs {
+            locator.encode(&mut encoder).unwrap();
+        }
+        assert!(locator.read_back(&mut encoder, frame).unwrap());
+        if is_refused {
+            // Something of the host's, that it may not clear.
+            let buffer = host.device.create_buffer(&wgpu::BufferDescriptor {
+                label: None,
+                size: 4,
+                usage: wgpu::BufferUsages::UNIFORM,
+                mapped_at_creation: false,
+            });
+            encoder.clear_buffer(&buffer, 0, None);
+        }
+        host.queue.submit([encoder.finish()]);
+        assert_eq!(pollster::block_on(scope.pop()).is_some(), is_refused);
+        let located = locator.wait(PATIENCE).unwrap();
+        // Negative control: the last one ran.
+        assert_eq!(located.as_ref().map(|l| l.frame), (frame == 4).then_some(4));
+        if let Some(located) = located {
+            assert!(agree(&located.estimates[0], &expected(&model, &picture(2))));
+        }
+    }
+}
+
+#[test]
 fn results_can_be_awaited() {
     let (host, model) = (Host::new(), model());
     let mut locator = host.locator(&model);

@@ -195,7 +195,8 @@ impl BatchLocator {
             return Err(GpuError::Lost(lost).into());
         }
         let slot = flight.slot;
-        let mut frames = mapped(&slot.results, |bytes| self.plan.frames_in(bytes))?;
+        let mut frames =
+            mapped(&slot.results, |bytes| self.plan.frames_in(bytes))?.ok_or_else(Plan::not_run)?;
         if let Some(masks) = &slot.masks {
             mapped(masks, |bytes| self.plan.put_masks(&mut frames, bytes))?;
         }

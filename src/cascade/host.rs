@@ -353,7 +353,8 @@ impl HostLocator {
         Ok(())
     }
 
-    /// The newest results that arrived since the last call, if any did. Never waits; polls the device.
+    /// The newest results that arrived since the last call, if any did. A frame that did not run, as its encoder was dropped or
+    /// the submission refused, has none. Never waits; polls the device.
     ///
     /// # Errors
     /// A device that was lost: no frame on its way will arrive.
@@ -362,35 +363,44 @@ impl HostLocator {
         self.device.poll(wgpu::PollType::Poll)?;
         #[cfg(target_arch = "wasm32")]
         self.device.check()?;
-        let mut newest = None;
+        let (mut newest, mut failure) = (None, None);
         for _ in 0..self.in_flight.len() {
             let Some(mut flight) = self.in_flight.pop_front() else {
                 break;
             };
-            match flight.mapping.state() {
+            let state = flight.mapping.state();
+            if state == Mapped::Pending {
+                self.in_flight.push_back(flight);
+                continue;
+            }
+            let Flight { slot, frame, .. } = flight;
+            let frames = match state {
+                Mapped::Ready => mapped(&slot.results, |bytes| self.plan.frames_in(bytes)),
                 Mapped::Failed => {
                     let lost = "a frame's results will not arrive".to_owned();
-                    return Err(GpuError::Lost(lost).into());
-                }
-                Mapped::Pending => {
-                    self.in_flight.push_back(flight);
-                    continue;
+                    Err(GpuError::Lost(lost))
                 }
                 // Its encoder was dropped.
-                Mapped::Never => {}
-                Mapped::Ready => {
-                    let frames = mapped(&flight.slot.results, |bytes| self.plan.frames_in(bytes))?;
-                    let estimates = frames.into_iter().zip(&flight.slot.views);
+                Mapped::Never | Mapped::Pending => Ok(None),
+            };
+            match frames {
+                Ok(Some(frames)) => {
+                    let estimates = frames.into_iter().zip(&slot.views);
                     let estimates = estimates.map(|(frame, view)| {
                         Estimate::new(&self.description, frame, view, Output::default())
                     });
                     newest = Some(Located {
-                        frame: flight.frame,
+                        frame,
                         estimates: estimates.collect(),
                     });
                 }
+                Ok(None) => {}
+                Err(error) => failure = Some(error),
             }
-            self.idle.push(flight.slot);
+            self.idle.push(slot);
+        }
+        if let Some(failure) = failure {
+            return Err(failure.into());
         }
         Ok(newest)
     }

@@ -38,7 +38,8 @@ impl Totals {
 }
 
 /// Counts and bounds the pixels of each `mask` `[1, height, width]` that reach the thresholds
-/// `(threshold, sure_threshold)`, into `totals`: one [`Totals`] an image, cleared before each run.
+/// `(threshold, sure_threshold)`, into `totals`: one [`Totals`] an image, cleared before each run. Adds 1 to `runs`, a
+/// `u32`.
 ///
 /// # Errors
 /// More pixels than a dispatch holds. Driver errors reach the caller's [`Device::scoped`].
@@ -46,6 +47,7 @@ pub fn coverage(
     device: &Device,
     mask: &Tensor,
     totals: &wgpu::Buffer,
+    runs: &wgpu::Buffer,
     (threshold, sure_threshold): (f32, f32),
 ) -> Result<Step, GpuError> {
     Step::new(
@@ -61,7 +63,10 @@ pub fn coverage(
                 ("SURE_THRESHOLD", f64::from(sure_threshold)),
             ],
             sizes: &[],
-            bindings: &[(3, totals.as_entire_binding())],
+            bindings: &[
+                (3, totals.as_entire_binding()),
+                (4, runs.as_entire_binding()),
+            ],
             workgroups: mask.batch * (mask.shape.height * mask.shape.width).div_ceil(256),
             work: Work {
                 operations: 0,

@@ -11,8 +11,8 @@ use super::{Device, GpuError, NetworkPlan, Precision};
 use crate::camera::Rectification;
 use crate::network::{Coverage, Model};
 
-/// The whole cascade planned for a batch of images: rectify, mask network, coverage, overlay, joint
-/// network. Everything is allocated, compiled and bound once; a frame is one submission and one
+/// The whole cascade planned for a batch of images: rectify, mask network, overlay, joint network,
+/// coverage. Everything is allocated, compiled and bound once; a frame is one submission and one
 /// small readback.
 #[derive(Debug)]
 pub struct Plan {
@@ -21,6 +21,10 @@ pub struct Plan {
     mask: NetworkPlan,
     coverage: Step,
     totals: wgpu::Buffer,
+    /// How many frames ran to their end: a `u32`.
+    runs: wgpu::Buffer,
+    /// What it was in the newest frame whose results were read.
+    seen: u32,
     /// From the mask to the joint network's input.
     overlay: Vec<Step>,
     joint: NetworkPlan,
@@ -107,7 +111,8 @@ impl Plan {
             let output = mask.output();
             let presence = description.presence;
             let thresholds = (presence.mask_threshold, presence.sure_threshold);
-            let coverage = coverage(device, output, &totals, thresholds)?;
+            let runs = storage_buffer(device, "coverage: runs", size_of::<u32>() as u64)?;
+            let coverage = coverage(device, output, &totals, &runs, thresholds)?;
             let rule = description.overlay;
             let (overlay, zoomed) = match description.zoom {
                 None => {
@@ -124,13 +129,16 @@ impl Plan {
                     (vec![zoom, overlay], Some(Zoomed { step, joints }))
                 }
             };
-            let results = staging_buffer(device, joint.output().staging_size() + totals.size());
+            let results = joint.output().staging_size() + totals.size() + runs.size();
+            let results = staging_buffer(device, results);
             let masks = staging_buffer(device, output.staging_size());
             Ok(Self {
                 image,
                 rectify,
                 coverage,
                 totals,
+                runs,
+                seen: 0,
                 overlay,
                 results,
                 masks,
@@ -223,17 +231,18 @@ impl Plan {
         self.overlay.iter().chain(self.joint.steps()).chain(back)
     }
 
-    /// The dispatches of a frame, in order; those of the joint network only `with_joints`.
+    /// The dispatches of a frame, in order; those of the joint network only `with_joints`. Coverage, which counts the
+    /// frames that ran, is the last.
     pub fn steps(&self, with_joints: bool) -> impl Iterator<Item = &Step> {
         self.rectify
             .iter()
             .filter_map(Rectify::step)
             .chain(self.mask.steps())
-            .chain([&self.coverage])
             .chain(
                 self.joint_steps()
                     .take(if with_joints { usize::MAX } else { 0 }),
             )
+            .chain([&self.coverage])
     }
 
     /// Runs a frame and waits for it: the result of each image of the batch. The masks are read back
@@ -243,7 +252,7 @@ impl Plan {
     /// As [`Device::wait`].
     #[cfg(not(target_arch = "wasm32"))]
     pub fn run(
-        &self,
+        &mut self,
         device: &Device,
         with_joints: bool,
         with_mask: bool,
@@ -256,7 +265,7 @@ impl Plan {
     /// # Errors
     /// Those.
     pub async fn run_async(
-        &self,
+        &mut self,
         device: &Device,
         with_joints: bool,
         with_mask: bool,
@@ -301,16 +310,18 @@ impl Plan {
 
     /// A buffer for [`Self::copy_results`], to be mapped.
     pub(crate) fn results_buffer(&self, device: &Device) -> wgpu::Buffer {
-        let joints = self.joints().staging_size();
-        staging_buffer(device, joints + self.totals.size())
+        staging_buffer(device, self.results.size())
     }
 
     /// Records the copy of a frame's results, for [`Self::frames_in`].
     pub(crate) fn copy_results(&self, encoder: &mut wgpu::CommandEncoder, results: &wgpu::Buffer) {
         let joints = self.joints();
-        let (after_joints, totals) = (joints.staging_size(), self.totals.size());
         joints.copy_to(encoder, results, 0);
-        encoder.copy_buffer_to_buffer(&self.totals, 0, results, after_joints, totals);
+        let mut at = joints.staging_size();
+        for buffer in [&self.totals, &self.runs] {
+            encoder.copy_buffer_to_buffer(buffer, 0, results, at, buffer.size());
+            at += buffer.size();
+        }
     }
 
     /// A buffer for [`Self::copy_masks`], to be mapped.
@@ -333,20 +344,33 @@ impl Plan {
         }
     }
 
-    /// What [`Self::copy_results`] copied: each image's, without masks.
-    pub(crate) fn frames_in(&self, bytes: &[u8]) -> Vec<Frame> {
+    /// What [`Self::copy_results`] copied: each image's, without masks. `None` where these are an earlier frame's results, as
+    /// the GPU did not run this one: a submission that was refused, or that failed on Metal, maps its buffers all the
+    /// same. Frames are to be read in the order of their submissions.
+    pub(crate) fn frames_in(&mut self, bytes: &[u8]) -> Option<Vec<Frame>> {
         let shape = self.image.shape;
         let (width, height) = (shape.width as u32, shape.height as u32);
-        let (joints, totals) = bytes.split_at(self.joints().staging_size() as usize);
-        totals
+        let (joints, rest) = bytes.split_at(self.joints().staging_size() as usize);
+        let (totals, runs) = rest.split_at(self.totals.size() as usize);
+        let runs: u32 = bytemuck::pod_read_unaligned(runs);
+        if !(1..1 << 31).contains(&runs.wrapping_sub(self.seen)) {
+            return None;
+        }
+        self.seen = runs;
+        let frames = totals
             .chunks_exact(size_of::<Totals>())
             .zip(self.joints_in(joints))
             .map(|(totals, joints)| Frame {
                 coverage: bytemuck::pod_read_unaligned::<Totals>(totals).coverage(width, height),
                 joints,
                 mask: Vec::new(),
-            })
-            .collect()
+            });
+        Some(frames.collect())
+    }
+
+    /// What is wrong with a device of our own where [`Self::frames_in`] finds nothing.
+    pub(crate) fn not_run() -> GpuError {
+        GpuError::Lost("a frame that was submitted did not run".into())
     }
 
     /// Waits for a frame that was submitted as [`Plan::encode`] recorded it: the result of each image.
@@ -355,13 +379,14 @@ impl Plan {
     /// # Errors
     /// As [`Device::wait`].
     pub async fn read_async(
-        &self,
+        &mut self,
         device: &Device,
         with_joints: bool,
         with_mask: bool,
     ) -> Result<Vec<Frame>, GpuError> {
-        let frames = device.read_async(&self.results, |bytes| self.frames_in(bytes));
-        let mut frames = frames.await?;
+        let results = self.results.clone();
+        let frames = device.read_async(&results, |bytes| self.frames_in(bytes));
+        let mut frames = frames.await?.ok_or_else(Self::not_run)?;
         if !with_joints {
             frames.iter_mut().for_each(|frame| frame.joints.clear());
         }
@@ -379,24 +404,19 @@ impl Plan {
     /// As [`Device::wait`], and another number of values.
     #[cfg(not(target_arch = "wasm32"))]
     pub fn run_with_masks(
-        &self,
+        &mut self,
         device: &Device,
         masks: &[f32],
     ) -> Result<Vec<Vec<f32>>, GpuError> {
         self.mask.output().write(device, masks)?;
         let mut encoder = device.wgpu().create_command_encoder(&Default::default());
-        let mut pass = encoder.begin_compute_pass(&Default::default());
-        for step in self.rectify.iter().filter_map(Rectify::step) {
-            step.encode(&mut pass);
-        }
-        for step in self.joint_steps() {
-            step.encode(&mut pass);
-        }
-        drop(pass);
-        let joints = self.joints();
-        joints.copy_to(&mut encoder, &self.results, 0);
+        let sources = self.rectify.iter().filter_map(Rectify::step);
+        let steps = sources.chain(self.joint_steps()).chain([&self.coverage]);
+        self.dispatch(&mut encoder, steps, None);
+        self.copy_results(&mut encoder, &self.results);
         device.queue().submit([encoder.finish()]);
-        device.read(&self.results, |bytes| self.joints_in(bytes))
+        let frames = pollster::block_on(self.read_async(device, true, false))?;
+        Ok(frames.into_iter().map(|frame| frame.joints).collect())
     }
 
     /// Each image's joints at the beginning of the results as they were copied.

@@ -296,7 +296,8 @@ pub(super) async fn coverage(
         let size = (batch * size_of::<Totals>()) as u64;
         let totals = buffer(device, size, STORAGE);
         let readback = buffer(device, size, BufferUsages::MAP_READ);
-        let step = gpu::coverage(device, &tensor, &totals, THRESHOLDS)?;
+        let runs = buffer(device, 4, STORAGE);
+        let step = gpu::coverage(device, &tensor, &totals, &runs, THRESHOLDS)?;
         Ok((totals, readback, step))
     })?;
     let (width, height) = (shape.width as u32, shape.height as u32);
