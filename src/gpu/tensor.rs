@@ -256,9 +256,6 @@ impl Tensor {
     /// Writes numbers in [-1, 1), some of which repeat. For buffers.
     #[cfg(not(target_arch = "wasm32"))]
     pub(super) fn fill(&self, device: &Device) {
-        let Memory::Buffer { buffer, offset, .. } = &self.memory else {
-            return;
-        };
         // A prime number of texels: not every row or plane begins with the same.
         let numbers = (0..4 * 16_381_u32).map(|i| i.wrapping_mul(2_654_435_761) as i32 as f32);
         let numbers = numbers.map(|number| number / (1_u32 << 31) as f32);
@@ -269,6 +266,21 @@ impl Tensor {
                 .flat_map(|v| f16::from_f32(v).to_le_bytes())
                 .collect()
         };
+        self.repeat(device, &bytes);
+    }
+
+    /// Writes what is no number. For buffers.
+    #[cfg(not(target_arch = "wasm32"))]
+    pub(super) fn spoil(&self, device: &Device) {
+        self.repeat(device, &[0xff; 1 << 16]);
+    }
+
+    /// Writes `bytes` again and again.
+    #[cfg(not(target_arch = "wasm32"))]
+    fn repeat(&self, device: &Device, bytes: &[u8]) {
+        let Memory::Buffer { buffer, offset, .. } = &self.memory else {
+            return;
+        };
         // A batch's input is hundreds of megabytes: one piece goes to the device, and copies of it stay there.
         let piece = device.wgpu().create_buffer(&wgpu::BufferDescriptor {
             label: Some("numbers"),
@@ -276,7 +288,7 @@ impl Tensor {
             usage: wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
         });
-        device.queue().write_buffer(&piece, 0, &bytes);
+        device.queue().write_buffer(&piece, 0, bytes);
         let mut encoder = device.wgpu().create_command_encoder(&Default::default());
         let end = offset + (self.texel_size() * self.texels()) as u64;
         for at in (*offset..end).step_by(bytes.len()) {

@@ -190,7 +190,8 @@ fn fastest(
     deadline: Instant,
 ) -> Result<Found, GpuError> {
     conv.input.fill(device);
-    let expected = answer(device, conv)?;
+    let plainest = device.scoped(|| by(Conv2dKernel::Buffer, device, conv))?;
+    let expected = answer(device, conv, &plainest)?;
     let (mut contestants, mut refused) = (Vec::new(), Vec::new());
     let mut of_all = true;
     for &kernel in candidates {
@@ -242,11 +243,25 @@ fn fastest(
     })
 }
 
-/// What the plainest kernel makes of what the layer reads.
-fn answer(device: &Device, conv: &Conv2d<'_>) -> Result<Vec<f32>, GpuError> {
-    let step = device.scoped(|| by(Conv2dKernel::Buffer, device, conv))?;
-    run(device, &step, 1)?;
+/// What `step` makes of what the layer reads. What it does not write is no number, whatever was there before.
+fn answer(device: &Device, conv: &Conv2d<'_>, step: &Step) -> Result<Vec<f32>, GpuError> {
+    conv.output.spoil(device);
+    run(device, step, 1)?;
     conv.output.sample(device)
+}
+
+/// Whether `step` answers as expected.
+fn is_right(
+    device: &Device,
+    conv: &Conv2d<'_>,
+    step: &Step,
+    expected: &[f32],
+) -> Result<bool, GpuError> {
+    let found = answer(device, conv, step)?;
+    let greatest = expected.iter().fold(0.0_f32, |most, v| most.max(v.abs()));
+    // Products of halves are off by a thousandth; what is put together wrongly, by far more.
+    let right = |(found, expected): (&f32, &f32)| (found - expected).abs() <= 0.02 * greatest;
+    Ok(found.iter().zip(expected).all(right))
 }
 
 /// A kernel that answers rightly.
@@ -265,12 +280,7 @@ fn contestant(
     expected: &[f32],
 ) -> Result<Option<Contestant>, GpuError> {
     let step = device.scoped(|| by(kernel, device, conv))?;
-    run(device, &step, 1)?;
-    let found = conv.output.sample(device)?;
-    let greatest = expected.iter().fold(0.0_f32, |most, v| most.max(v.abs()));
-    // Products of halves are off by a thousandth; what is put together wrongly, by far more.
-    let right = |(found, expected): (&f32, &f32)| (found - expected).abs() <= 0.02 * greatest;
-    if !found.iter().zip(expected).all(right) {
+    if !is_right(device, conv, &step, expected)? {
         return Ok(None);
     }
     // The first run may have compiled.
@@ -299,10 +309,10 @@ mod tests {
     use crate::gpu::{AdapterRequest, Tensor};
     use crate::network::{Activation, Parameters, Shape};
 
-    /// What a tuner chooses among `candidates` for a small layer between buffers.
-    fn choose(device: &Device, tuner: &Tuner, candidates: &[Conv2dKernel]) -> Option<Conv2dKernel> {
+    /// What `ask` says of a small layer between buffers in `layout`.
+    fn with_layer<T>(device: &Device, layout: Layout, ask: impl FnOnce(&Conv2d<'_>) -> T) -> T {
         let shape = Shape::new(8, 5, 6);
-        let tensor = |what| Tensor::in_layout(device, Layout::Buffer, what, shape, 1, 0).unwrap();
+        let tensor = |what| Tensor::in_layout(device, layout, what, shape, 1, 0).unwrap();
         let parameters = Parameters {
             weight: (0..64).map(|i| (i as f32).sin()).collect(),
             bias: vec![0.5; 8],
@@ -317,7 +327,37 @@ mod tests {
             activation: Activation::None,
             pool: None,
         };
-        tuner.choose(device, &conv, candidates).unwrap()
+        ask(&conv)
+    }
+
+    /// What a tuner chooses among `candidates` for it.
+    fn choose(device: &Device, tuner: &Tuner, candidates: &[Conv2dKernel]) -> Option<Conv2dKernel> {
+        with_layer(device, Layout::Buffer, |conv| {
+            tuner.choose(device, conv, candidates).unwrap()
+        })
+    }
+
+    #[test]
+    fn a_kernel_that_writes_nothing_is_not_right() {
+        let device = Device::open(&AdapterRequest::new(None, None)).unwrap();
+        for layout in [Layout::Buffer, Layout::HalfBuffer] {
+            with_layer(&device, layout, |conv| {
+                let by = |conv: &Conv2d<'_>| by(Conv2dKernel::Tiled(2), &device, conv).unwrap();
+                let step = by(conv);
+                let expected = answer(&device, conv, &step).unwrap();
+                assert!(expected.iter().all(|v| v.is_finite()));
+                // It writes, but elsewhere.
+                let shape = conv.output.shape;
+                let elsewhere = Tensor::in_layout(&device, layout, "elsewhere", shape, 1, 0);
+                let idle = by(&Conv2d {
+                    output: &elsewhere.unwrap(),
+                    ..*conv
+                });
+                assert!(!is_right(&device, conv, &idle, &expected).unwrap());
+                // Negative control: one that writes.
+                assert!(is_right(&device, conv, &step, &expected).unwrap());
+            });
+        }
     }
 
     #[test]
