@@ -256,7 +256,10 @@ impl Device {
         &self.tuner
     }
 
-    /// The pipeline of a kernel. Driver errors reach the caller's [`Device::scoped`].
+    /// The pipeline of a kernel.
+    ///
+    /// # Errors
+    /// A kernel that the driver does not compile, or too little memory.
     pub(super) fn pipeline(
         &self,
         label: &str,
@@ -264,9 +267,9 @@ impl Device {
         entry_point: &str,
         constants: &[(&str, f64)],
         checks: Checks,
-    ) -> wgpu::ComputePipeline {
+    ) -> Result<wgpu::ComputePipeline, GpuError> {
         self.pipelines
-            .get(&self.device, label, text, entry_point, constants, checks)
+            .get(self, label, text, entry_point, constants, checks)
     }
 
     /// Gives the first fault that happened since the device was opened.

@@ -2,6 +2,8 @@ use std::collections::HashMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::{Mutex, PoisonError};
 
+use super::{Device, GpuError};
+
 /// The pipelines of a device, made once for each text and set of constants: compiling is dear, and many
 /// layers differ by what they bind only.
 #[derive(Default)]
@@ -57,16 +59,19 @@ impl Pipelines {
         Some(memory)
     }
 
-    /// The pipeline of a kernel. Driver errors reach the error scope of the caller.
+    /// The pipeline of a kernel.
+    ///
+    /// # Errors
+    /// A kernel that the driver does not compile, or too little memory: it is not kept then.
     pub fn get(
         &self,
-        device: &wgpu::Device,
+        device: &Device,
         label: &str,
         text: String,
         entry_point: &str,
         constants: &[(&str, f64)],
         checks: Checks,
-    ) -> wgpu::ComputePipeline {
+    ) -> Result<wgpu::ComputePipeline, GpuError> {
         let bits = constants
             .iter()
             .map(|(name, value)| ((*name).to_owned(), value.to_bits()))
@@ -74,11 +79,28 @@ impl Pipelines {
         let key = (text, entry_point.to_owned(), bits, checks);
         let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(pipeline) = made.get(&key) {
-            return pipeline.clone();
+            return Ok(pipeline.clone());
         }
+        let pipeline = device.scoped(|| {
+            let (text, entry_point, _, checks) = &key;
+            Ok(self.make(device.wgpu(), label, text, entry_point, constants, *checks))
+        })?;
+        made.insert(key, pipeline.clone());
+        Ok(pipeline)
+    }
+
+    fn make(
+        &self,
+        device: &wgpu::Device,
+        label: &str,
+        text: &str,
+        entry_point: &str,
+        constants: &[(&str, f64)],
+        checks: Checks,
+    ) -> wgpu::ComputePipeline {
         let source = wgpu::ShaderModuleDescriptor {
             label: Some(label),
-            source: wgpu::ShaderSource::Wgsl(key.0.as_str().into()),
+            source: wgpu::ShaderSource::Wgsl(text.into()),
         };
         let module = match checks {
             Checks::Kept => device.create_shader_module(source),
@@ -90,7 +112,7 @@ impl Pipelines {
                 device.create_shader_module_trusted(source, unchecked)
             },
         };
-        let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+        device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
             label: Some(label),
             layout: None,
             module: &module,
@@ -100,9 +122,7 @@ impl Pipelines {
                 zero_initialize_workgroup_memory: checks == Checks::Kept,
             },
             cache: self.cache.as_ref(),
-        });
-        made.insert(key, pipeline.clone());
-        pipeline
+        })
     }
 }
 
@@ -111,4 +131,29 @@ fn checksum(data: &[u8]) -> u64 {
     let mut hasher = DefaultHasher::new();
     data.hash(&mut hasher);
     hasher.finish()
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use crate::gpu::AdapterRequest;
+
+    #[test]
+    fn what_was_not_compiled_is_not_kept() {
+        let device = Device::open(&AdapterRequest::new(None, None)).unwrap();
+        let pipelines = Pipelines::default();
+        let get = |text: &str| {
+            let made = pipelines.get(&device, "kernel", text.into(), "main", &[], Checks::Kept);
+            made.map_err(|error| error.to_string())
+        };
+        let wrong = "@compute @workgroup_size(1) fn main() { nothing(); }";
+        let first = get(wrong).unwrap_err();
+        assert!(first.contains("nothing"), "{first}");
+        // The next one who asks is told the same.
+        assert_eq!(get(wrong).unwrap_err(), first);
+        // Negative control: what was compiled is kept.
+        let right = "@compute @workgroup_size(1) fn main() {}";
+        assert_eq!(get(right).unwrap(), get(right).unwrap());
+    }
 }

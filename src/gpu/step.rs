@@ -157,7 +157,7 @@ impl Step {
             .chain(step.constants.iter().copied())
             .collect();
         let text = kernel_text(step.tensors.layout(), step.sizes, step.source);
-        let pipeline = device.pipeline(step.label, text, step.entry_point, &constants, checks);
+        let pipeline = device.pipeline(step.label, text, step.entry_point, &constants, checks)?;
         let bind_group = bind(device, &pipeline, step.tensors, step.bindings);
         // A dimension holds 65,535 workgroups at most: long dispatches are folded into rows.
         let row = device.wgpu().limits().max_compute_workgroups_per_dimension as usize;
