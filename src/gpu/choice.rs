@@ -131,7 +131,7 @@ impl fmt::Display for Conv2dKernel {
 }
 
 /// Plans a convolution: by `only`, if it is given, or by what the device's tuner finds to be the fastest,
-/// or else by the first kernel that suits.
+/// or else by the first kernel that suits and that the driver compiles.
 pub(super) fn conv2d(
     device: &Device,
     conv: &Conv2d<'_>,
@@ -139,22 +139,40 @@ pub(super) fn conv2d(
 ) -> Result<Step, GpuError> {
     let mut candidates = Conv2dKernel::ALL.to_vec();
     candidates.retain(|kernel| kernel.runs_on(device) && kernel.serves(conv));
-    let chosen = match only {
-        Some(only) => candidates.contains(&only).then_some(only),
-        None => match tuned(device, conv, &candidates)? {
-            Some(fastest) => Some(fastest),
-            None => candidates
-                .into_iter()
-                .find(|kernel| kernel.suits(device, conv)),
-        },
-    };
-    match chosen {
-        Some(kernel) => by(kernel, device, conv),
-        None => Err(GpuError::Kernel {
-            layer: conv.label.to_owned(),
-            wanted: only.map_or("conv2d".into(), |only| only.to_string()),
-        }),
+    match only {
+        Some(only) => candidates.retain(|&kernel| kernel == only),
+        None => {
+            let fastest = tuned(device, conv, &candidates)?;
+            candidates.retain(|kernel| kernel.suits(device, conv));
+            candidates.splice(..0, fastest);
+        }
     }
+    first_of(&candidates, device, conv)?.ok_or_else(|| GpuError::Kernel {
+        layer: conv.label.to_owned(),
+        wanted: only.map_or("conv2d".into(), |only| only.to_string()),
+    })
+}
+
+/// A convolution by the first of `candidates` that the driver takes; `None` of none. In a browser, whose errors come late, by
+/// the first.
+fn first_of(
+    candidates: &[Conv2dKernel],
+    device: &Device,
+    conv: &Conv2d<'_>,
+) -> Result<Option<Step>, GpuError> {
+    let mut candidates = candidates.iter().peekable();
+    while let Some(&kernel) = candidates.next() {
+        match device.scoped(|| by(kernel, device, conv)) {
+            Err(error @ (GpuError::Driver(_) | GpuError::Validation(_)))
+                if candidates.peek().is_some() =>
+            {
+                device.check()?;
+                log::warn!("{}: `{kernel}` is not used: {error}", conv.label);
+            }
+            made => return made.map(Some),
+        }
+    }
+    Ok(None)
 }
 
 /// What the device's tuner finds to be the fastest; `None` in a browser, where nothing can be waited for.
@@ -197,5 +215,45 @@ pub(super) fn by(
         Conv2dKernel::Cooperative(pixels) => cooperative(device, conv, pixels),
         Conv2dKernel::Tiled(pixels) => tiled(device, conv, pixels),
         Conv2dKernel::Buffer => buffer(device, conv),
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use crate::gpu::{AdapterRequest, Tensor};
+    use crate::network::{Activation, Parameters, Shape};
+
+    #[test]
+    fn what_the_driver_does_not_take_is_passed_over() {
+        let device = Device::open(&AdapterRequest::new(None, None)).unwrap();
+        let shape = Shape::new(4, 3, 3);
+        let tensor = |what| Tensor::in_layout(&device, Layout::Buffer, what, shape, 1, 0).unwrap();
+        let conv = Conv2d {
+            label: "layer",
+            input: &tensor("input"),
+            output: &tensor("output"),
+            parameters: &Parameters {
+                weight: vec![1.0; 16],
+                bias: vec![0.0; 4],
+            },
+            kernel: 1,
+            dilation: 1,
+            activation: Activation::None,
+            pool: None,
+        };
+        let first = |candidates: &[Conv2dKernel]| {
+            let step = first_of(candidates, &device, &conv)?;
+            Ok::<_, GpuError>(step.map(|step| step.kernel()))
+        };
+        // It binds textures, and gets buffers.
+        let wrong = Conv2dKernel::Texture;
+        let found = first(&[wrong, Conv2dKernel::Tiled(1), Conv2dKernel::Buffer]);
+        assert_eq!(found.unwrap(), Some("conv2d_tiled"));
+        device.check().unwrap();
+        // Negative control: alone it is what the driver says of it.
+        assert!(matches!(first(&[wrong]), Err(GpuError::Validation(_))));
+        assert_eq!(first(&[]).unwrap(), None);
     }
 }
