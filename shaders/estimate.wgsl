@@ -24,7 +24,7 @@ fn value(image: u32, index: u32) -> f32 {
 }
 
 fn finite(value: f32) -> bool {
-    // By its bits: a compiler may assume that a float is a number.
+    // By its bits, as they were loaded: a compiler may assume that a float, and what is worked out of one, is a number.
     return (bitcast<u32>(value) & 0x7f800000u) != 0x7f800000u;
 }
 
@@ -32,9 +32,12 @@ fn possible(joint: vec3<f32>, most: f32) -> bool {
     if !(finite(joint.x) && finite(joint.y) && finite(joint.z) && joint.z > 0.0) {
         return false;
     }
+    // No lens shows rays farther than 1e9 from its axis, and of nearer ones the quotient is finite.
+    if max(abs(joint.x), abs(joint.y)) > 2e9 * joint.z {
+        return false;
+    }
     let ray = joint.xy / joint.z;
-    let radius = dot(ray, ray);
-    return finite(radius) && radius <= most * most;
+    return dot(ray, ray) <= most * most;
 }
 
 @compute @workgroup_size(64)

@@ -46,11 +46,15 @@ fn sample(texel: vec2<u32>) -> f32 {
     let corner = vec2<u32>(inside);
     let next = min(corner + 1u, last);
     let part = inside - floor(inside);
-    let top = mix(mask_at(corner), mask_at(vec2(next.x, corner.y)), part.x);
-    let bottom = mix(mask_at(vec2(corner.x, next.y)), mask_at(next), part.x);
-    let value = mix(top, bottom, part.y);
-    // By its bits: a compiler may assume that a float is a number.
-    return select(0.0, value, (bitcast<u32>(value) & 0x7f800000u) != 0x7f800000u);
+    let left = vec2(mask_at(corner), mask_at(vec2(corner.x, next.y)));
+    let right = vec2(mask_at(vec2(next.x, corner.y)), mask_at(next));
+    // By their bits, as they were loaded: a compiler may assume that a float, and what is worked out of one, is a number.
+    let exponents = bitcast<vec4<u32>>(vec4(left, right)) & vec4(0x7f800000u);
+    if any(exponents == vec4(0x7f800000u)) {
+        return 0.0;
+    }
+    let rows = mix(left, right, part.x);
+    return mix(rows.x, rows.y, part.y);
 }
 
 @compute @workgroup_size(64)
