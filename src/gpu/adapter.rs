@@ -208,10 +208,12 @@ fn choose(reports: &[AdapterReport], request: &AdapterRequest) -> Result<Choice,
     let reason = format!("{} = {}", wanted.origin, wanted.value);
     let name = wanted.value.to_lowercase();
     let by_index = name.parse().ok().filter(|&index| index < reports.len());
+    let is_named = |report: &AdapterReport| report.info.name.to_lowercase().contains(&name);
+    // A card has an adapter a backend, not each of which may be usable.
     let by_name = || {
-        reports
-            .iter()
-            .position(|report| report.info.name.to_lowercase().contains(&name))
+        let usable = |report: &AdapterReport| is_named(report) && report.unusable.is_none();
+        let first = reports.iter().position(usable);
+        first.or_else(|| reports.iter().position(is_named))
     };
     let unknown = || GpuError::UnknownAdapter {
         wanted: wanted.value.clone(),
@@ -331,6 +333,18 @@ mod tests {
     fn a_name_in_any_case_or_an_index_is_found() {
         assert_eq!(chosen(&three(), &wants("LLVM")), Some(0));
         assert_eq!(chosen(&three(), &wants("1")), Some(1));
+    }
+
+    #[test]
+    fn of_a_name_the_first_usable_adapter_is_found() {
+        let mut reports = three();
+        assert_eq!(chosen(&reports, &wants("card")), Some(1));
+        reports[1].unusable = Some("no compute shaders".into());
+        assert_eq!(chosen(&reports, &wants("card")), Some(2));
+        // Where none is, the error says why not.
+        reports[2].unusable = Some("too few buffers".into());
+        let error = choose(&reports, &wants("card")).unwrap_err().to_string();
+        assert!(error.contains("no compute shaders"), "{error}");
     }
 
     #[test]
