@@ -51,7 +51,7 @@ pub(super) fn dense(
             work: Work::new(
                 Tensors::from(input),
                 parameters.weight.len() + sums,
-                input.batch * parameters.weight.len(),
+                input.batch as u64 * parameters.weight.len() as u64,
             ),
         },
     )?;

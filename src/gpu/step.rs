@@ -25,10 +25,10 @@ pub struct Work {
 
 impl Work {
     /// Reads or writes each of `tensors` and `parameters` values, and does so many `multiply_adds`.
-    pub(super) fn new(tensors: Tensors<'_>, parameters: usize, multiply_adds: usize) -> Self {
+    pub(super) fn new(tensors: Tensors<'_>, parameters: usize, multiply_adds: u64) -> Self {
         let activations: u64 = tensors.named().map(|(.., tensor)| tensor.bytes()).sum();
         Self {
-            operations: 2 * multiply_adds as u64,
+            operations: 2 * multiply_adds,
             bytes: activations + 4 * parameters as u64,
         }
     }

@@ -229,20 +229,22 @@ impl Operation {
 
     /// Multiply-accumulates for one image with an input of shape `input`.
     pub fn macs(&self, input: Shape) -> u64 {
-        match *self {
+        let factors = match *self {
             Self::Conv2d {
                 out_channels,
                 kernel,
                 ..
-            } => (input.len() * out_channels * kernel * kernel) as u64,
-            Self::Dense { out_features, .. } => (input.len() * out_features) as u64,
+            } => [input.len(), out_channels, kernel, kernel],
+            Self::Dense { out_features, .. } => [input.len(), out_features, 1, 1],
             Self::MaxPool2d { .. }
             | Self::Sigmoid
             | Self::Upsample2d { .. }
             | Self::Concat
             | Self::SoftArgmax2d { .. }
-            | Self::BackProject => 0,
-        }
+            | Self::BackProject => [0; 4],
+        };
+        // In a browser more than a usize.
+        factors.iter().map(|&factor| factor as u64).product()
     }
 }
 

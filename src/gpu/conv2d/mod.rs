@@ -48,7 +48,8 @@ impl Conv2d<'_> {
         Work::new(
             Tensors::from_to(self.input, self.output),
             weights + self.parameters.bias.len(),
-            self.output.batch * height * width * weights,
+            // In a browser more than a usize.
+            (self.output.batch * height * width) as u64 * weights as u64,
         )
     }
 
