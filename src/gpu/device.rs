@@ -399,7 +399,7 @@ impl Device {
         pollster::block_on(self.read_async(buffer, read))
     }
 
-    /// As [`Device::read`]: in a browser without blocking, elsewhere blocking all the same.
+    /// As [`Device::read`]: in a browser without blocking, elsewhere blocking all the same. May be dropped before it is done.
     ///
     /// # Errors
     /// Those.
@@ -410,6 +410,7 @@ impl Device {
     ) -> Result<T, GpuError> {
         let (mapping, callback) = Mapping::new();
         buffer.map_async(wgpu::MapMode::Read, .., callback);
+        let pending = Pending(buffer);
         let done = async {
             #[cfg(not(target_arch = "wasm32"))]
             self.wait()?;
@@ -418,12 +419,21 @@ impl Device {
             self.check()
         };
         let done = done.await;
-        if let Err(GpuError::Timeout(_)) = done {
-            // It would be mapped later, and what is written to it then be refused.
-            buffer.unmap();
+        if !matches!(done, Err(GpuError::Timeout(_))) {
+            std::mem::forget(pending);
         }
         done?;
         mapped(buffer, read)
+    }
+}
+
+/// A buffer that is to be mapped, for somebody who may stop waiting: it would be mapped later, and what is written to it
+/// then be refused.
+struct Pending<'a>(&'a wgpu::Buffer);
+
+impl Drop for Pending<'_> {
+    fn drop(&mut self) {
+        self.0.unmap();
     }
 }
 
@@ -479,5 +489,32 @@ mod tests {
         // Where the loss was not told, the panic tells.
         let device = Device::open(&AdapterRequest::new(None, None)).unwrap();
         assert!(is_lost(device.survive(|| panic!("unknown"))));
+    }
+
+    #[test]
+    fn a_buffer_that_nobody_waits_for_is_written_again() {
+        let device = Device::open(&AdapterRequest::new(None, None)).unwrap();
+        let buffer = super::super::tensor::staging_buffer(&device, 1 << 16);
+        let submit = || {
+            let mut encoder = device.device.create_command_encoder(&Default::default());
+            encoder.clear_buffer(&buffer, 0, None);
+            device.queue.submit([encoder.finish()]);
+        };
+        let map = || buffer.map_async(wgpu::MapMode::Read, .., |_| ());
+        for done in [false, true] {
+            submit();
+            map();
+            let pending = Pending(&buffer);
+            if done {
+                device.wait().unwrap();
+            }
+            drop(pending);
+        }
+        submit();
+        device.read(&buffer, |_| ()).unwrap();
+        // Negative control: one that is still to be mapped.
+        map();
+        submit();
+        assert!(matches!(device.check(), Err(GpuError::Validation(_))));
     }
 }
