@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use common::{ORIENTATIONS, description, difference, joints, model_file, noise};
 use image::{DynamicImage, Rgba, RgbaImage};
-use whereabot::camera::{Camera, Crop, Unrectification};
+use whereabot::camera::{Camera, Crop, Orientation, Unrectification};
 use whereabot::cascade::{
     Estimate, HostLocator, HostOptions, LocateError, Located, Locator, MaskSize, Output, Source,
     Status,
@@ -361,6 +361,85 @@ fn a_part_of_a_turned_texture_is_what_it_is_upright() {
             first = Some(values);
         }
     }
+}
+
+#[test]
+fn a_mask_follows_a_camera_that_changes_in_the_texture_that_it_has() {
+    let (host, model) = (Host::new(), model());
+    let image = picture(1);
+    let view = host.rgba(&image);
+    let options = HostOptions {
+        mask: MaskSize::Source,
+        ..Default::default()
+    };
+    let mut locator = HostLocator::new(host.ours(), &model, options).unwrap();
+    let (whole, upright) = (Crop::whole(WIDTH, HEIGHT), Orientation::NoTransforms);
+    let mut drawn = Vec::new();
+    let mut last = None;
+    for hfov in [1.2, 0.9, 0.6] {
+        let camera = Camera::from_hfov(WIDTH, HEIGHT, hfov);
+        let source = Source::new(view.clone(), camera);
+        locator.set_source(0, &source).unwrap();
+        // What the host drew with is what it goes on drawing with.
+        let mask = locator.mask(0).unwrap().clone();
+        assert_eq!(*last.get_or_insert(mask.clone()), mask);
+        host.run(&mut locator);
+        let found = Locator::on_cpu(&model).locate(
+            &image,
+            &camera,
+            Output {
+                mask: true,
+                mask_only: true,
+            },
+        );
+        let found = found.unwrap().mask.unwrap();
+        let shape = Shape::new(1, found.height as usize, found.width as usize);
+        let found = reference::Tensor::new(shape, found.probability).unwrap();
+        let params = Unrectification::new(&camera, &model.description.camera, whole, upright);
+        let expected = reference::unrectify(&found, &params);
+        let values = host.values(&mask);
+        assert!(difference(&values, &expected).unwrap() < 0.51 / 255.0 + 1e-4);
+        drawn.push(values);
+    }
+    // Negative control: they are not the same; and another size is another texture.
+    assert!(difference(&drawn[0], &drawn[1]).unwrap() > 0.02);
+    assert!(difference(&drawn[1], &drawn[2]).unwrap() > 0.02);
+    let source = Source::new(host.rgba(&RgbaImage::new(40, 30)), camera(40, 30));
+    locator.set_source(0, &source).unwrap();
+    assert_ne!(last.as_ref(), locator.mask(0));
+}
+
+#[test]
+fn a_source_whose_mask_has_no_room_is_refused_and_the_former_stays() {
+    let limits = wgpu::Limits {
+        max_storage_buffer_binding_size: 1 << 20,
+        ..Default::default()
+    };
+    let host = Host::with(wgpu::Features::empty(), limits).unwrap();
+    let model = model();
+    let options = HostOptions {
+        mask: MaskSize::Source,
+        ..Default::default()
+    };
+    let mut locator = HostLocator::new(host.ours(), &model, options).unwrap();
+    let source = Source::new(host.rgba(&picture(1)), camera(WIDTH, HEIGHT));
+    locator.set_source(0, &source).unwrap();
+    let mask = locator.mask(0).unwrap().clone();
+    let (width, height) = (4096, 300);
+    let large = host.texture(wgpu::TextureFormat::Rgba8Unorm, [width, height], &[]);
+    let large = Source::new(large, camera(width, height));
+    // However often it is tried.
+    for _ in 0..2 {
+        let error = locator.set_source(0, &large).unwrap_err().to_string();
+        assert!(error.contains("mask: bytes"), "{error}");
+    }
+    let found = host.run(&mut locator);
+    assert!(agree(&found.estimates[0], &expected(&model, &picture(1))));
+    assert_eq!(locator.mask(0), Some(&mask));
+    // Negative control: what has room is taken.
+    let source = Source::new(host.rgba(&RgbaImage::new(40, 30)), camera(40, 30));
+    locator.set_source(0, &source).unwrap();
+    assert_ne!(locator.mask(0), Some(&mask));
 }
 
 #[test]

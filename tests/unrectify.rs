@@ -27,7 +27,7 @@ fn on_gpu(layout: Layout, masks: &[f32], index: usize, params: &Unrectification)
     let batch = masks.len() / SHAPE.len();
     let tensor = Tensor::in_layout(&device, layout, "mask", SHAPE, batch, 0).unwrap();
     tensor.write(&device, masks).unwrap();
-    let made = device.scoped(|| Unrectify::new(&device, &tensor, index, params.clone()));
+    let made = device.scoped(|| Unrectify::new(&device, &tensor, index, params));
     let unrectify = made.unwrap();
     let [width, height] = params.size;
     let row = width.next_multiple_of(wgpu::COPY_BYTES_PER_ROW_ALIGNMENT);

@@ -141,7 +141,7 @@ impl HostLocator {
     /// in [`HostLocator::warm_up`].
     ///
     /// # Errors
-    /// A layer that exceeds the device's limits, or a driver's refusal.
+    /// A batch of none, a layer that exceeds the device's limits, or a driver's refusal.
     pub fn new(
         device: Arc<Device>,
         model: &Model,
@@ -204,8 +204,8 @@ impl HostLocator {
     ///
     /// # Errors
     /// An index beyond the batch; a texture of another format, size or usage than what can be read; a camera
-    /// of another size than the image; a crop beyond it: the former source stays then. Too little memory for
-    /// a mask texture of the new size: then the new source is searched, and the mask keeps its former size.
+    /// of another size than the image; a crop beyond it; too little memory for a mask texture of the new size. The
+    /// former source stays then.
     pub fn set_source(&mut self, index: usize, source: &Source) -> Result<(), LocateError> {
         self.device.check()?;
         let [width, height] = source.planes.size();
@@ -225,6 +225,16 @@ impl HostLocator {
         let last = self.views.get(index).copied().flatten();
         let size = crop.turned(source.orientation);
         let view = View::of(last, camera, size, texels, &self.description)?;
+        // What may fail comes first: then nothing is changed.
+        let mask = if last != Some(view) && self.mask == MaskSize::Source {
+            let canonical = &self.description.camera;
+            let params = Unrectification::new(camera, canonical, crop, source.orientation);
+            let (device, plan) = (&self.device, &self.plan);
+            let resized = self.outputs.resized_mask(device, plan, index, &params)?;
+            Some((params, resized))
+        } else {
+            None
+        };
         self.plan
             .bind(&self.device, index, &source.planes, &view.rectification)?;
         if let Some(place) = self.views.get_mut(index) {
@@ -233,12 +243,9 @@ impl HostLocator {
         if last != Some(view) {
             let max_radius = view.rectification.max_radius;
             self.outputs.set_max_radius(&self.device, index, max_radius);
-            if self.mask == MaskSize::Source {
-                let canonical = &self.description.camera;
-                let params = Unrectification::new(camera, canonical, crop, source.orientation);
-                self.outputs
-                    .set_mask(&self.device, &self.plan, index, params)?;
-            }
+        }
+        if let Some((params, resized)) = mask {
+            self.outputs.set_mask(&self.device, index, &params, resized);
         }
         Ok(())
     }
@@ -259,7 +266,7 @@ impl HostLocator {
     }
 
     /// The mask of image `index`, a texture of `r8unorm` with the usages `TEXTURE_BINDING` and `COPY_SRC`;
-    /// `None` beyond the batch. Another one after [`HostLocator::set_source`] gave it another size.
+    /// `None` beyond the batch. Another one after [`HostLocator::set_source`] gave it another size, and only then.
     pub fn mask(&self, index: usize) -> Option<&wgpu::TextureView> {
         self.outputs.masks().get(index).map(|mask| mask.view())
     }

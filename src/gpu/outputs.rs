@@ -26,7 +26,7 @@ impl Outputs {
             Unrectification::identity(mask.shape.width as u32, mask.shape.height as u32);
         device.scoped(|| {
             let masks = (0..batch)
-                .map(|index| Unrectify::new(device, mask, index, canonical.clone()))
+                .map(|index| Unrectify::new(device, mask, index, &canonical))
                 .collect::<Result<_, _>>()?;
             let size = batch as u64 * estimate_size(joints.shape.channels / 3);
             let estimates = storage_buffer(device, "estimates", size)?;
@@ -58,23 +58,39 @@ impl Outputs {
             .write_buffer(&self.max_radius, offset, &bytes);
     }
 
-    /// Gives image `index` another mask texture, unless it has one for `params`.
+    /// A mask texture for image `index` as `params` say; `None` where the one that it has is of that size.
     ///
     /// # Errors
-    /// An image beyond the adapter's limits.
-    pub fn set_mask(
-        &mut self,
+    /// An image beyond the adapter's limits, or too little memory.
+    pub fn resized_mask(
+        &self,
         device: &Device,
         plan: &Plan,
         index: usize,
-        params: Unrectification,
-    ) -> Result<(), GpuError> {
-        if let Some(mask) = self.masks.get_mut(index)
-            && *mask.params() != params
-        {
-            *mask = device.scoped(|| Unrectify::new(device, plan.mask(), index, params))?;
+        params: &Unrectification,
+    ) -> Result<Option<Unrectify>, GpuError> {
+        let mask = self.masks.get(index);
+        if mask.is_none_or(|mask| mask.size() == params.size) {
+            return Ok(None);
         }
-        Ok(())
+        device.scoped(|| Unrectify::new(device, plan.mask(), index, params).map(Some))
+    }
+
+    /// Makes the mask of image `index` as `params` say, from the queue's next submission on: in the texture that
+    /// [`Outputs::resized_mask`] gave for them.
+    pub fn set_mask(
+        &mut self,
+        device: &Device,
+        index: usize,
+        params: &Unrectification,
+        resized: Option<Unrectify>,
+    ) {
+        if let Some(mask) = self.masks.get_mut(index) {
+            match resized {
+                Some(resized) => *mask = resized,
+                None => mask.write(device, params),
+            }
+        }
     }
 
     /// The mask textures, one an image.

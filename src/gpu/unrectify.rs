@@ -9,8 +9,8 @@ use crate::camera::Unrectification;
 /// (`shaders/unrectify.wgsl`).
 #[derive(Debug)]
 pub struct Unrectify {
-    params: Unrectification,
     step: Step,
+    nodes: wgpu::Buffer,
     bytes: wgpu::Buffer,
     texture: wgpu::Texture,
     view: wgpu::TextureView,
@@ -36,7 +36,7 @@ impl Unrectify {
         device: &Device,
         mask: &Tensor,
         index: usize,
-        params: Unrectification,
+        params: &Unrectification,
     ) -> Result<Self, GpuError> {
         let [width, height] = params.size;
         let side = device.wgpu().limits().max_texture_dimension_2d;
@@ -65,7 +65,7 @@ impl Unrectify {
             index: index as u32,
             padding: [0; 3],
         };
-        let nodes = bytemuck::cast_slice(&params.nodes);
+        let nodes = buffer("unrectify: nodes", bytemuck::cast_slice(&params.nodes));
         let step = Step::new(
             device,
             &StepDescriptor {
@@ -81,13 +81,13 @@ impl Unrectify {
                         3,
                         buffer("unrectify: params", bytemuck::bytes_of(&read)).as_entire_binding(),
                     ),
-                    (4, buffer("unrectify: nodes", nodes).as_entire_binding()),
+                    (4, nodes.as_entire_binding()),
                     (5, bytes.as_entire_binding()),
                 ],
                 workgroups: (row as usize / 4 * height as usize).div_ceil(64),
                 work: Work {
                     operations: 0,
-                    bytes: 4 * mask.shape.len() as u64 + nodes.len() as u64 + bytes.size(),
+                    bytes: 4 * mask.shape.len() as u64 + nodes.size() + bytes.size(),
                 },
             },
         )?;
@@ -108,17 +108,23 @@ impl Unrectify {
             view_formats: &[],
         });
         Ok(Self {
-            params,
             step,
+            nodes,
             bytes,
             view: texture.create_view(&Default::default()),
             texture,
         })
     }
 
-    /// What it was made for.
-    pub fn params(&self) -> &Unrectification {
-        &self.params
+    /// Columns and rows.
+    pub fn size(&self) -> [u32; 2] {
+        [self.texture.width(), self.texture.height()]
+    }
+
+    /// As other `params` of its size say, from the queue's next submission on.
+    pub fn write(&self, device: &Device, params: &Unrectification) {
+        let nodes = bytemuck::cast_slice(&params.nodes);
+        device.queue().write_buffer(&self.nodes, 0, nodes);
     }
 
     /// The texture: `r8unorm`, to be bound and copied from.

@@ -460,7 +460,7 @@ pub(super) async fn unrectify(
     let tensor = Tensor::in_layout(device, layout, "mask", shape, batch, 0)?;
     let row = side.next_multiple_of(wgpu::COPY_BYTES_PER_ROW_ALIGNMENT);
     let (unrectify, readback) = device.scoped(|| {
-        let unrectify = Unrectify::new(device, &tensor, 0, params.clone())?;
+        let unrectify = Unrectify::new(device, &tensor, 0, &params)?;
         let size = u64::from(row) * u64::from(side);
         Ok((unrectify, buffer(device, size, BufferUsages::MAP_READ)))
     })?;
