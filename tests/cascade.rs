@@ -6,7 +6,10 @@ mod common;
 use common::{Driver, description, device, difference, driver, joints, model_file, noise};
 use image::RgbaImage;
 use whereabot::camera::{Camera, Rectification};
-use whereabot::cascade::{Estimate, Locator, Output, Status};
+use whereabot::cascade::{
+    BatchImage, BatchLocator, BatchOptions, Estimate, HostLocator, HostOptions, LocateError,
+    Locator, Output, Status,
+};
 use whereabot::gpu::{Frame, GpuError, Plan, Precision};
 use whereabot::network::{Layer, Model, Network, Operation};
 
@@ -268,4 +271,61 @@ fn a_zoomed_joint_network_sees_something_else() {
     });
     assert_eq!(mask(&plain), mask(&zoomed));
     assert!(difference(&joints(&plain), &joints(&zoomed)).unwrap() > 1e-3);
+}
+
+#[test]
+fn a_batch_of_none_and_a_camera_twice_are_refused_in_words() {
+    let model = Model::from_bytes(&model_file(&description(32, 24, 4), 1), "random").unwrap();
+    let options = BatchOptions {
+        precision: Precision::F32,
+        cameras: 3,
+        batch: 2,
+        in_flight: 1,
+        mask: false,
+    };
+    let new = |options| BatchLocator::new(device(), &model, options);
+    let of_none = [
+        (
+            BatchOptions {
+                batch: 0,
+                ..options
+            },
+            "batch",
+        ),
+        (
+            BatchOptions {
+                in_flight: 0,
+                ..options
+            },
+            "in_flight",
+        ),
+    ];
+    for (options, what) in of_none {
+        let error = new(options).unwrap_err();
+        assert!(matches!(&error, LocateError::Gpu(GpuError::Zero { .. })));
+        assert!(error.to_string().starts_with(what), "{error}");
+    }
+    let options_of_host = HostOptions {
+        batch: 0,
+        ..Default::default()
+    };
+    let error = HostLocator::new(device(), &model, options_of_host).unwrap_err();
+    assert!(matches!(error, LocateError::Gpu(GpuError::Zero { .. })));
+
+    let mut locator = new(options).unwrap();
+    let (picture, camera) = (picture(40, 30, 1), Camera::from_hfov(40, 30, 1.0));
+    let images = |places: [usize; 2]| {
+        places.map(|place| BatchImage {
+            place,
+            image: &picture,
+            camera: &camera,
+        })
+    };
+    let error = locator.submit(&images([1, 1])).unwrap_err();
+    assert!(
+        matches!(error, LocateError::SameCamera { place: 1 }),
+        "{error}"
+    );
+    // Negative control: nothing was submitted, and two cameras are taken.
+    assert!(locator.submit(&images([2, 1])).unwrap());
 }

@@ -76,7 +76,7 @@ impl BatchLocator {
     /// Plans `model`: allocates, compiles and binds everything but what depends on the images' sizes.
     ///
     /// # Errors
-    /// A layer that exceeds the device's limits, or a driver's refusal.
+    /// A batch, or submissions on their way, of none; a layer that exceeds the device's limits, or a driver's refusal.
     pub fn new(
         device: Arc<Device>,
         model: &Model,
@@ -85,6 +85,9 @@ impl BatchLocator {
         let BatchOptions {
             precision, batch, ..
         } = options;
+        if options.in_flight == 0 {
+            return Err(GpuError::Zero { what: "in_flight" }.into());
+        }
         let plan = Box::new(Plan::new(&device, model, batch, precision)?);
         let (cameras, idle) = device.scoped(|| {
             let places = (0..options.cameras).map(|_| Place {
@@ -121,7 +124,7 @@ impl BatchLocator {
     /// [`BatchOptions::in_flight`] are on their way already: nothing is submitted then. Nothing is waited for.
     ///
     /// # Errors
-    /// Another number of images, a camera that there is not, an image of another size than its camera's or beyond
+    /// Another number of images, a camera that there is not, two images of one camera, an image of another size than its camera's or beyond
     /// the adapter's limits; a device that was lost.
     pub fn submit(&mut self, images: &[BatchImage<'_>]) -> Result<bool, LocateError> {
         self.device.check()?;
@@ -133,6 +136,11 @@ impl BatchLocator {
                 found: images.len(),
             }
             .into());
+        }
+        for (index, BatchImage { place, .. }) in images.iter().enumerate() {
+            if images.iter().take(index).any(|other| other.place == *place) {
+                return Err(LocateError::SameCamera { place: *place });
+            }
         }
         let Some(mut slot) = self.idle.pop() else {
             return Ok(false);

@@ -78,6 +78,12 @@ pub enum LocateError {
         /// Which image of the batch.
         index: usize,
     },
+    /// A submission with two images of one camera, which has one texture.
+    #[error("images of a submission: expected one a camera, found two of camera {place}")]
+    SameCamera {
+        /// The camera's place.
+        place: usize,
+    },
     /// A part of an image that it does not have.
     #[error("crop: expected a part of {width} x {height} texels, found {crop:?}")]
     Crop {

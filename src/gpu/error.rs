@@ -81,6 +81,12 @@ pub enum GpuError {
         /// What was given.
         found: usize,
     },
+    /// A plan for none.
+    #[error("{what}: expected at least 1, found 0")]
+    Zero {
+        /// Of which there are none.
+        what: &'static str,
+    },
     /// A host's texture that cannot be read.
     #[error("{what}: expected {expected}, found {found}")]
     Source {

@@ -55,7 +55,7 @@ impl Plan {
     /// Plans `model` for `batch` images a frame, with activations in `precision`.
     ///
     /// # Errors
-    /// A layer that exceeds the adapter's limits, or a driver's refusal.
+    /// A batch of none, a layer that exceeds the adapter's limits, or a driver's refusal.
     pub fn new(
         device: &Device,
         model: &Model,
@@ -73,6 +73,9 @@ impl Plan {
         precision: Precision,
         progress: &mut dyn FnMut(usize, usize),
     ) -> Result<Self, GpuError> {
+        if batch == 0 {
+            return Err(GpuError::Zero { what: "batch" });
+        }
         let networks = [&model.mask_network, &model.joint_network];
         let layers = networks.iter().map(|network| network.nodes().len()).sum();
         let mut done = 0;
