@@ -975,7 +975,9 @@ fn compiled_kernels_of_strangers_are_passed_over() {
     let open = || Device::open(&whereabot::gpu::AdapterRequest::new(None, None)).unwrap();
     let model = model();
     let run = |memory: &[u8]| {
-        let device = open().with_pipeline_cache(memory);
+        // SAFETY: it is the device's own, or has no right checksum.
+        #[allow(unsafe_code)]
+        let device = unsafe { open().with_pipeline_cache(memory) };
         let mut locator = Locator::on_gpu(Arc::new(device), &model, Default::default()).unwrap();
         let found = locator
             .locate(&picture(1), &camera(WIDTH, HEIGHT), Output::default())

@@ -42,7 +42,9 @@ impl EngineArgs {
         match Device::open(&request) {
             Ok(device) => {
                 let pipelines = remembered(&device, PIPELINES);
-                let device = device.with_pipeline_cache(&pipelines);
+                // SAFETY: it lies in the user's own folder, as this program does or whatever else the user runs.
+                #[allow(unsafe_code)]
+                let device = unsafe { device.with_pipeline_cache(&pipelines) };
                 if self.no_tuning {
                     return Ok(Some(Arc::new(device)));
                 }

@@ -112,7 +112,7 @@ impl Device {
         device.set_device_lost_callback(move |reason, message| {
             lost(GpuError::Lost(format!("{reason:?}: {message}")));
         });
-        let pipelines = Pipelines::new(&device, &[]);
+        let pipelines = Pipelines::new(&device);
         Ok(Self {
             tier,
             halves: adapter
@@ -149,7 +149,7 @@ impl Device {
             choice: None,
             fault: Arc::default(),
             loss: Some(Loss::new(&device)),
-            pipelines: Pipelines::new(&device, &[]),
+            pipelines: Pipelines::new(&device),
             device,
             queue,
         };
@@ -239,9 +239,15 @@ impl Device {
     /// process; what is of another adapter, driver or version, damaged, or no such thing at all, is passed
     /// over. Without effect where the backend has no such cache, or a host did not enable
     /// `PIPELINE_CACHE`.
+    ///
+    /// # Safety
+    /// `memory` comes from where nobody puts what was made to look like a cache: the checksum tells damage, not intent,
+    /// and a driver may run what it finds.
     #[must_use]
-    pub fn with_pipeline_cache(mut self, memory: &[u8]) -> Self {
-        self.pipelines = Pipelines::new(&self.device, memory);
+    #[allow(unsafe_code)]
+    pub unsafe fn with_pipeline_cache(mut self, memory: &[u8]) -> Self {
+        // SAFETY: the caller answers for `memory`.
+        self.pipelines = unsafe { Pipelines::with(&self.device, memory) };
         self
     }
 

@@ -27,17 +27,29 @@ pub(super) enum Checks {
 }
 
 impl Pipelines {
+    /// Without what was remembered.
+    pub fn new(device: &wgpu::Device) -> Self {
+        // SAFETY: nobody made that.
+        #[allow(unsafe_code)]
+        unsafe {
+            Self::with(device, &[])
+        }
+    }
+
     /// With what [`Self::memory`] gave in an earlier process; what is foreign or damaged is passed over.
-    pub fn new(device: &wgpu::Device, memory: &[u8]) -> Self {
+    ///
+    /// # Safety
+    /// That of [`Device::with_pipeline_cache`].
+    #[allow(unsafe_code)]
+    pub unsafe fn with(device: &wgpu::Device, memory: &[u8]) -> Self {
         if !device.features().contains(wgpu::Features::PIPELINE_CACHE) {
             return Self::default();
         }
         let data = memory
             .split_first_chunk()
             .and_then(|(sum, data)| (u64::from_le_bytes(*sum) == checksum(data)).then_some(data));
-        // SAFETY: the data is what wgpu gave: a checksum says that it is whole, and wgpu itself passes over
-        // what is of another adapter, driver or version.
-        #[allow(unsafe_code)]
+        // SAFETY: the data is what wgpu gave: nobody made it up, by our own contract, a checksum says that it is whole, and
+        // wgpu itself passes over what is of another adapter, driver or version.
         let cache = unsafe {
             device.create_pipeline_cache(&wgpu::PipelineCacheDescriptor {
                 label: Some("whereabot"),
