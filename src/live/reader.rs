@@ -1,4 +1,5 @@
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
@@ -14,8 +15,8 @@ use crate::camera::{Camera, Crop, Orientation, Texels};
 pub(super) struct Reader {
     pub camera: usize,
     pub input: Input,
-    /// The longest side that the engine takes, in pixels.
-    pub max_side: u32,
+    /// The longest side that the engine takes now, in pixels.
+    pub max_side: Arc<AtomicU32>,
     pub mailboxes: Arc<Mailboxes>,
     pub messages: Sender<Message>,
     pub stop: Arc<Stop>,
@@ -99,17 +100,18 @@ impl Reader {
         let number = memory.number;
         memory.number += 1;
         let camera = match shot.camera {
-            Some(camera) => camera,
+            Some(camera) => camera.for_image(stored.width(), stored.height())?,
             None => self
                 .input
                 .calibration
                 .camera(stored.width(), stored.height())?,
         };
         let longest = camera.width.max(camera.height);
-        if longest > self.max_side || camera.width.min(camera.height) == 0 {
+        let max_side = self.max_side.load(Ordering::Relaxed);
+        if longest > max_side || camera.width.min(camera.height) == 0 {
             return Err(SourceError::Frame(format!(
-                "expected an image of 1 to {} pixels on a side, found {} x {}",
-                self.max_side, camera.width, camera.height
+                "expected an image of 1 to {max_side} pixels on a side, found {} x {}",
+                camera.width, camera.height
             )));
         }
         if !upright {

@@ -1,5 +1,6 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
@@ -18,11 +19,15 @@ pub(super) struct Scheduler {
     engine: Box<dyn Engine>,
     /// Each camera's robot.
     robots: Vec<usize>,
+    /// The longest side that the engine takes now, in pixels, for the readers.
+    max_side: Arc<AtomicU32>,
     mailboxes: Arc<Mailboxes>,
     messages: Sender<Message>,
     stop: Arc<Stop>,
     /// In which round each camera was served last.
     served: Vec<u64>,
+    /// Of each camera.
+    trust: Vec<Trust>,
     round: u64,
     under_way: VecDeque<Submission>,
     service: Service,
@@ -30,6 +35,17 @@ pub(super) struct Scheduler {
     patience: Duration,
     /// Used again each time: the cameras that have a frame.
     fresh: Vec<usize>,
+}
+
+/// What is known of a camera's frames since its last answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Trust {
+    /// Nothing bad.
+    Full,
+    /// One was in a submission of several that the engine refused: it may be the one to blame, so the next goes alone.
+    Alone,
+    /// One was refused alone, and that is told. They still go alone.
+    Refused,
 }
 
 struct Submission {
@@ -48,6 +64,7 @@ impl Scheduler {
     pub fn new(
         engine: Box<dyn Engine>,
         robots: Vec<usize>,
+        max_side: Arc<AtomicU32>,
         mailboxes: Arc<Mailboxes>,
         messages: Sender<Message>,
         stop: Arc<Stop>,
@@ -55,8 +72,10 @@ impl Scheduler {
         Self {
             engine,
             served: vec![0; robots.len()],
+            trust: vec![Trust::Full; robots.len()],
             fresh: Vec::with_capacity(robots.len()),
             robots,
+            max_side,
             mailboxes,
             messages,
             stop,
@@ -115,11 +134,18 @@ impl Scheduler {
         self.mailboxes.fresh(&mut self.fresh);
         let served = &self.served;
         self.fresh.sort_by_key(|&camera| served.get(camera));
-        let robot = |camera: &usize| self.robots.get(*camera).copied().unwrap_or_default();
-        let Some(first) = self.fresh.first().map(robot) else {
+        let Some(&oldest) = self.fresh.first() else {
             return Ok(());
         };
-        self.fresh.retain(|camera| robot(camera) == first);
+        let robot = |camera: usize| self.robots.get(camera).copied().unwrap_or_default();
+        let first = robot(oldest);
+        let trusted = |camera: usize| self.trust.get(camera) == Some(&Trust::Full);
+        if trusted(oldest) {
+            self.fresh
+                .retain(|&camera| robot(camera) == first && trusted(camera));
+        } else {
+            self.fresh.truncate(1);
+        }
         self.fresh
             .truncate(self.engine.batch(first, self.fresh.len()));
         self.round += 1;
@@ -136,11 +162,41 @@ impl Scheduler {
             submitted: begun,
         });
         if let Some(submission) = self.under_way.back_mut() {
-            self.engine.submit(first, &submission.frames)?;
-            submission.submitted = Instant::now();
-            self.service.submitted(submission.submitted - begun);
+            match self.engine.submit(first, &submission.frames) {
+                Ok(()) => {
+                    submission.submitted = Instant::now();
+                    self.service.submitted(submission.submitted - begun);
+                }
+                Err(error) if is_of_device(&error) => return Err(error),
+                Err(error) => self.refused(&error),
+            }
         }
         Ok(())
+    }
+
+    /// The engine did not take the newest submission. What is on its way does not suffer.
+    fn refused(&mut self, error: &LocateError) {
+        let frames = self
+            .under_way
+            .pop_back()
+            .map_or_else(Vec::new, |s| s.frames);
+        let alone = frames.len() == 1;
+        for frame in frames {
+            self.mailboxes.lose(frame.camera);
+            let Some(trust) = self.trust.get_mut(frame.camera) else {
+                continue;
+            };
+            let now = if alone { Trust::Refused } else { Trust::Alone };
+            let before = std::mem::replace(trust, now);
+            if alone && before != Trust::Refused {
+                self.tell(Message::Failed {
+                    camera: frame.camera,
+                    reason: error.to_string(),
+                    // With the next frame.
+                    retry_in: Duration::ZERO,
+                });
+            }
+        }
     }
 
     /// Tells what was found in the oldest submission.
@@ -154,6 +210,9 @@ impl Scheduler {
         self.service
             .finished(submission.submitted, count, answered_at);
         for (frame, estimate) in submission.frames.into_iter().zip(estimates) {
+            if let Some(trust) = self.trust.get_mut(frame.camera) {
+                *trust = Trust::Full;
+            }
             self.tell(Message::Answered(Box::new(Observation {
                 camera: frame.camera,
                 frame: frame.number,
@@ -182,7 +241,11 @@ impl Scheduler {
             }
             self.patience = (2 * self.patience).clamp(Self::RETRY, Self::RETRY_MOST);
             match self.engine.reopen() {
-                Ok(()) => return self.tell(Message::DeviceBack),
+                Ok(()) => {
+                    self.max_side
+                        .store(self.engine.max_side(), Ordering::Relaxed);
+                    return self.tell(Message::DeviceBack);
+                }
                 Err(error) => log::warn!("no device: {error}; tried again in {:?}", self.patience),
             }
         }
@@ -192,4 +255,11 @@ impl Scheduler {
         // Nobody listens any more when everything stops.
         let _ = self.messages.send(message);
     }
+}
+
+/// Whether a submission failed by the device, which is to be opened again then; else by the frames themselves. A device that has a
+/// fault says so in [`Engine::finished`], too.
+fn is_of_device(error: &LocateError) -> bool {
+    use GpuError::{Driver, Lost, Timeout};
+    matches!(error, LocateError::Gpu(Lost(_) | Timeout(_) | Driver(_)))
 }

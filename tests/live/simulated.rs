@@ -5,8 +5,9 @@ use std::sync::{Arc, Mutex, mpsc};
 use std::time::{Duration, Instant, SystemTime};
 
 use image::{Rgba, RgbaImage};
-use whereabot::camera::Orientation;
+use whereabot::camera::{Camera, Orientation};
 use whereabot::cascade::{Estimate, LocateError, Status};
+use whereabot::gpu::GpuError;
 use whereabot::live::{
     Calibration, Engine, Event, EventKind, Frame, IN_FLIGHT, Input, KnownModel, Observation, Shot,
     Sink, Source, SourceError, Statistics, Stop, Stream,
@@ -40,6 +41,8 @@ pub struct Simulated {
     pub pause: Option<(u64, Duration)>,
     /// From which frame on its clock is how much behind.
     pub clock_back: Option<(u64, Duration)>,
+    /// What it says its camera is; its images have 64 x 48 pixels.
+    pub camera: Option<Camera>,
 }
 
 impl Simulated {
@@ -49,6 +52,7 @@ impl Simulated {
             count,
             pause: None,
             clock_back: None,
+            camera: None,
         }
     }
 
@@ -71,6 +75,7 @@ impl Source for Simulated {
             next: Instant::now(),
             pause: self.pause,
             clock_back: self.clock_back,
+            camera: self.camera,
             stop: Arc::clone(stop),
         }))
     }
@@ -83,6 +88,7 @@ struct Frames {
     next: Instant,
     pause: Option<(u64, Duration)>,
     clock_back: Option<(u64, Duration)>,
+    camera: Option<Camera>,
     stop: Arc<Stop>,
 }
 
@@ -107,7 +113,10 @@ impl Stream for Frames {
         }
         let red = 128 + (self.number * 37 % 128) as u8;
         image.pixels_mut().for_each(|p| *p = Rgba([red, 0, 0, 255]));
-        let mut shot = Shot::now();
+        let mut shot = Shot {
+            camera: self.camera,
+            ..Shot::now()
+        };
         if let Some((frame, back)) = self.clock_back
             && self.number >= frame
         {
@@ -123,6 +132,10 @@ pub struct StandIn {
     pub service: Duration,
     pub batch: usize,
     pub max_side: u32,
+    /// The camera whose frames it cannot take.
+    pub refuses: Option<usize>,
+    /// Its device is lost after so many submissions; the next one takes a longest side of so many pixels.
+    pub lost: Option<(usize, u32)>,
     under_way: VecDeque<(Instant, usize)>,
 }
 
@@ -132,6 +145,8 @@ impl StandIn {
             service,
             batch,
             max_side: 8192,
+            refuses: None,
+            lost: None,
             under_way: VecDeque::new(),
         }
     }
@@ -148,6 +163,14 @@ impl Engine for StandIn {
 
     fn submit(&mut self, _robot: usize, frames: &[Frame]) -> Result<(), LocateError> {
         assert!(self.under_way.len() < IN_FLIGHT && frames.len() <= self.batch);
+        if frames.iter().any(|f| self.refuses == Some(f.camera)) {
+            return Err(GpuError::OutOfMemory("no place for that".into()).into());
+        }
+        match &mut self.lost {
+            Some((0, _)) => return Err(GpuError::Lost("unplugged".into()).into()),
+            Some((left, _)) => *left -= 1,
+            None => {}
+        }
         let now = Instant::now();
         let begin = self.under_way.back().map_or(now, |&(end, _)| end.max(now));
         self.under_way
@@ -167,6 +190,9 @@ impl Engine for StandIn {
 
     fn reopen(&mut self) -> Result<(), LocateError> {
         self.under_way.clear();
+        if let Some((_, max_side)) = self.lost.take() {
+            self.max_side = max_side;
+        }
         Ok(())
     }
 }

@@ -45,7 +45,7 @@ pub struct Shot {
     pub acquired: SystemTime,
     /// The same by the monotonic clock.
     pub acquired_at: Instant,
-    /// Its camera, where the source knows.
+    /// Its camera, where the source knows: of the image's size.
     pub camera: Option<Camera>,
 }
 
