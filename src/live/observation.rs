@@ -85,7 +85,7 @@ pub struct Rates {
     /// Answers, a second.
     pub answers_per_s: f64,
     /// Frames that got no answer, since the start: replaced by newer ones before they were searched, refused by the
-    /// engine, or under way when a device was lost.
+    /// engine, under way when a device was lost, or answered while a sink made the answer before them wait.
     pub dropped: u64,
     /// Median of the answers' ages.
     pub age_p50: Option<Duration>,
@@ -104,6 +104,7 @@ pub struct Statistics {
 
 /// What a sink has to say to all others.
 #[derive(Debug, Clone)]
+#[non_exhaustive]
 pub enum Word {
     /// Something happened.
     Event(Event),

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use image::RgbaImage;
 
 use super::frame::{Pool, resize};
+use super::guard::guarded;
 use super::mailbox::Mailboxes;
 use super::message::Message;
 use super::{Frame, Input, SourceError, Stop, Stream};
@@ -36,7 +37,7 @@ impl Reader {
     pub fn run(mut self) {
         let mut memory = Memory::default();
         let mut patience = Patience::default();
-        while let Err(error) = self.read(&mut memory, &mut patience) {
+        while let Err(error) = self.guarded_read(&mut memory, &mut patience) {
             if self.stop.is_set() || self.wait(&error, &mut patience) {
                 break;
             }
@@ -46,7 +47,16 @@ impl Reader {
                 camera: self.camera,
             });
         }
-        self.mailboxes.close();
+    }
+
+    /// A source may be somebody else's.
+    fn guarded_read(
+        &mut self,
+        memory: &mut Memory,
+        patience: &mut Patience,
+    ) -> Result<(), SourceError> {
+        let read = guarded(|| self.read(memory, patience));
+        read.unwrap_or_else(|words| Err(SourceError::Panicked(words)))
     }
 
     /// Opens the source and reads it to its end.
@@ -142,6 +152,13 @@ impl Reader {
     fn tell(&self, message: Message) {
         // Nobody listens any more when everything stops.
         let _ = self.messages.send(message);
+    }
+}
+
+impl Drop for Reader {
+    /// However it ends: who waits for frames waits for no more of this camera.
+    fn drop(&mut self) {
+        self.mailboxes.close();
     }
 }
 

@@ -5,8 +5,9 @@ use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
 use super::engine::{Engine, IN_FLIGHT};
+use super::guard::guarded;
 use super::mailbox::{Mail, Mailboxes};
-use super::message::Message;
+use super::message::{Answer, Message};
 use super::service::Service;
 use super::{Frame, Observation, Stop};
 use crate::cascade::{Estimate, LocateError};
@@ -31,6 +32,8 @@ pub(super) struct Scheduler {
     round: u64,
     under_way: VecDeque<Submission>,
     service: Service,
+    /// Each camera's last answer, which nobody may have looked at yet.
+    answers: Vec<Answer>,
     /// How long to wait before a device is opened again: not at all after an answer.
     patience: Duration,
     /// Used again each time: the cameras that have a frame.
@@ -72,6 +75,7 @@ impl Scheduler {
         Self {
             engine,
             served: vec![0; robots.len()],
+            answers: robots.iter().map(|_| Answer::default()).collect(),
             trust: vec![Trust::Full; robots.len()],
             fresh: Vec::with_capacity(robots.len()),
             robots,
@@ -89,10 +93,12 @@ impl Scheduler {
     /// Until everything is to stop, or no camera has more frames and all are answered.
     pub fn run(mut self) {
         while !self.stop.is_set() {
-            match self.step() {
-                Ok(true) => {}
-                Ok(false) => return,
-                Err(error) => self.recover(&error),
+            // wgpu panics over some devices that are lost.
+            match guarded(|| self.step()) {
+                Ok(Ok(true)) => {}
+                Ok(Ok(false)) => return,
+                Ok(Err(error)) => self.recover(error.to_string()),
+                Err(words) => self.recover(format!("the engine panicked: {words}")),
             }
         }
     }
@@ -213,7 +219,7 @@ impl Scheduler {
             if let Some(trust) = self.trust.get_mut(frame.camera) {
                 *trust = Trust::Full;
             }
-            self.tell(Message::Answered(Box::new(Observation {
+            self.publish(Observation {
                 camera: frame.camera,
                 frame: frame.number,
                 acquired: frame.acquired,
@@ -222,31 +228,44 @@ impl Scheduler {
                 image: frame.image,
                 view: frame.view,
                 estimate,
-            })));
+            });
+        }
+    }
+
+    /// Takes the place of an answer of the same camera that nobody looked at: a sink that waits does not fill the memory.
+    fn publish(&mut self, observation: Observation) {
+        let camera = observation.camera;
+        let answer = Answer::new(observation);
+        self.tell(Message::Answered(answer.clone()));
+        if let Some(last) = self.answers.get_mut(camera)
+            && std::mem::replace(last, answer).take().is_some()
+        {
+            self.mailboxes.lose(camera);
         }
     }
 
     /// Opens the device again; what was under way is lost.
-    fn recover(&mut self, error: &LocateError) {
+    fn recover(&mut self, reason: String) {
         for frame in self.under_way.drain(..).flat_map(|s| s.frames) {
             self.mailboxes.lose(frame.camera);
         }
         self.service = Service::default();
-        self.tell(Message::DeviceLost {
-            reason: error.to_string(),
-        });
+        self.tell(Message::DeviceLost { reason });
         loop {
             if !self.patience.is_zero() && self.stop.wait(self.patience) {
                 return;
             }
             self.patience = (2 * self.patience).clamp(Self::RETRY, Self::RETRY_MOST);
-            match self.engine.reopen() {
+            let opened = guarded(|| self.engine.reopen());
+            match opened.and_then(|opened| opened.map_err(|error| error.to_string())) {
                 Ok(()) => {
                     self.max_side
                         .store(self.engine.max_side(), Ordering::Relaxed);
                     return self.tell(Message::DeviceBack);
                 }
-                Err(error) => log::warn!("no device: {error}; tried again in {:?}", self.patience),
+                Err(reason) => {
+                    log::warn!("no device: {reason}; tried again in {:?}", self.patience);
+                }
             }
         }
     }

@@ -161,7 +161,11 @@ impl Desk {
                 self.silence(camera);
                 self.event(Some(camera), EventKind::Ended);
             }
-            Message::Answered(observation) => {
+            Message::Answered(answer) => {
+                // A newer one is on its way where there is none.
+                let Some(observation) = answer.take() else {
+                    return;
+                };
                 if let Some(pulse) = self.pulses.get_mut(observation.camera) {
                     pulse.answered(observation.age());
                 }

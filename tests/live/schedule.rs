@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::simulated::{Collector, Simulated, StandIn, watch};
 use whereabot::camera::Camera;
-use whereabot::live::{EventKind, Input, Observation, Stop};
+use whereabot::live::{Event, EventKind, Input, Observation, Sink, Statistics, Stop};
 
 const MS: Duration = Duration::from_millis(1);
 
@@ -196,6 +196,107 @@ fn frames_that_the_engine_refuses_are_their_camera_s_failure() {
     let collector = run(None);
     assert!(answers(&collector.observations(), 3)[1] > 0);
     assert_eq!(failures(&collector), []);
+}
+
+#[test]
+fn a_source_that_panics_has_failed() {
+    let run = |panics_at| {
+        let broken = Simulated {
+            panics_at,
+            ..Simulated::new(20 * MS, 3)
+        };
+        let stop = Arc::new(Stop::default());
+        let collector = Collector::default();
+        let sinks = vec![Box::new(collector.clone()) as _];
+        let cameras = vec![broken.input(), Simulated::new(100 * MS, 5).input()];
+        let stopper = {
+            let (stop, collector) = (Arc::clone(&stop), collector.clone());
+            // It would be opened again and again.
+            std::thread::spawn(move || {
+                while failures(&collector).len() < 2 && !stop.wait(20 * MS) {}
+                stop.set();
+            })
+        };
+        watch(cameras, Box::new(StandIn::new(MS, 2)), sinks, &stop);
+        stop.set();
+        stopper.join().unwrap();
+        collector
+    };
+    let collector = run(Some(1));
+    let (camera, reason) = &failures(&collector)[0];
+    assert_eq!(*camera, Some(0));
+    assert!(reason.contains("this source is broken"), "{reason}");
+    // The frame before came, and the other camera was answered all the time.
+    let counts = answers(&collector.observations(), 2);
+    assert!(counts[0] >= 1 && counts[1] >= 2, "{counts:?}");
+    // Negative control: the last frame is not reached.
+    assert_eq!(failures(&run(Some(3))), []);
+}
+
+#[test]
+fn an_engine_that_panics_is_a_device_that_is_lost() {
+    let mut engine = StandIn::new(5 * MS, 1);
+    engine.panics = Some(3);
+    let collector = run(vec![Simulated::new(50 * MS, 20).input()], engine);
+    let events = collector.events();
+    let lost = events.iter().find_map(|(_, kind)| match kind {
+        EventKind::DeviceLost { reason } => Some(reason),
+        _ => None,
+    });
+    assert!(lost.unwrap().contains("this engine is broken"), "{lost:?}");
+    assert!(events.contains(&(None, EventKind::DeviceBack)));
+    assert!(answers(&collector.observations(), 1)[0] > 3);
+}
+
+/// A sink that takes a second for its first observation.
+struct Slow(Collector);
+
+impl Sink for Slow {
+    fn observation(&mut self, observation: &Observation) {
+        if self.0.observations().is_empty() {
+            std::thread::sleep(1000 * MS);
+        }
+        self.0.observation(observation);
+    }
+
+    fn event(&mut self, event: &Event) {
+        self.0.event(event);
+    }
+
+    fn statistics(&mut self, statistics: &Statistics) {
+        Sink::statistics(&mut self.0, statistics);
+    }
+}
+
+#[test]
+fn a_sink_that_waits_gets_the_newest_answers_and_all_events() {
+    const FRAMES: usize = 30;
+    let run = |slow: bool| {
+        let collector = Collector::default();
+        let sink: Box<dyn Sink> = if slow {
+            Box::new(Slow(collector.clone()))
+        } else {
+            Box::new(collector.clone())
+        };
+        let mut engine = StandIn::new(MS, 1);
+        engine.lost = Some((FRAMES / 3, 8192));
+        let cameras = vec![Simulated::new(50 * MS, FRAMES as u64).input()];
+        let stop = Arc::new(Stop::default());
+        watch(cameras, Box::new(engine), vec![sink], &stop);
+        collector
+    };
+    let collector = run(true);
+    let observations = collector.observations();
+    // Of those that came meanwhile, one.
+    assert!(observations.len() < FRAMES / 2, "{}", observations.len());
+    let last = FRAMES as u64 - 1;
+    assert_eq!(observations.last().unwrap().frame, last);
+    assert_eq!(losses(&collector), 1);
+    let statistics = collector.statistics();
+    let dropped = statistics.last().unwrap().cameras[0].dropped as usize;
+    assert!(dropped + observations.len() <= FRAMES && dropped > FRAMES / 3);
+    // Negative control: one that does not wait gets nearly all.
+    assert!(run(false).observations().len() > FRAMES * 2 / 3);
 }
 
 #[test]

@@ -41,6 +41,8 @@ pub struct Simulated {
     pub pause: Option<(u64, Duration)>,
     /// From which frame on its clock is how much behind.
     pub clock_back: Option<(u64, Duration)>,
+    /// At which frame it panics, each time that it is opened.
+    pub panics_at: Option<u64>,
     /// What it says its camera is; its images have 64 x 48 pixels.
     pub camera: Option<Camera>,
 }
@@ -52,6 +54,7 @@ impl Simulated {
             count,
             pause: None,
             clock_back: None,
+            panics_at: None,
             camera: None,
         }
     }
@@ -75,6 +78,7 @@ impl Source for Simulated {
             next: Instant::now(),
             pause: self.pause,
             clock_back: self.clock_back,
+            panics_at: self.panics_at,
             camera: self.camera,
             stop: Arc::clone(stop),
         }))
@@ -88,6 +92,7 @@ struct Frames {
     next: Instant,
     pause: Option<(u64, Duration)>,
     clock_back: Option<(u64, Duration)>,
+    panics_at: Option<u64>,
     camera: Option<Camera>,
     stop: Arc<Stop>,
 }
@@ -104,6 +109,7 @@ impl Stream for Frames {
             self.next += pause;
         }
         let now = Instant::now();
+        assert_ne!(self.panics_at, Some(self.number), "this source is broken");
         if self.stop.wait(self.next.saturating_duration_since(now)) {
             return Ok(None);
         }
@@ -136,6 +142,8 @@ pub struct StandIn {
     pub refuses: Option<usize>,
     /// Its device is lost after so many submissions; the next one takes a longest side of so many pixels.
     pub lost: Option<(usize, u32)>,
+    /// It panics after so many submissions, and once more when it is opened again.
+    pub panics: Option<usize>,
     under_way: VecDeque<(Instant, usize)>,
 }
 
@@ -147,6 +155,7 @@ impl StandIn {
             max_side: 8192,
             refuses: None,
             lost: None,
+            panics: None,
             under_way: VecDeque::new(),
         }
     }
@@ -165,6 +174,9 @@ impl Engine for StandIn {
         assert!(self.under_way.len() < IN_FLIGHT && frames.len() <= self.batch);
         if frames.iter().any(|f| self.refuses == Some(f.camera)) {
             return Err(GpuError::OutOfMemory("no place for that".into()).into());
+        }
+        if let Some(left) = &mut self.panics {
+            *left = left.checked_sub(1).expect("this engine is broken");
         }
         match &mut self.lost {
             Some((0, _)) => return Err(GpuError::Lost("unplugged".into()).into()),
@@ -190,6 +202,7 @@ impl Engine for StandIn {
 
     fn reopen(&mut self) -> Result<(), LocateError> {
         self.under_way.clear();
+        assert!(self.panics.take().is_none(), "this engine is broken, too");
         if let Some((_, max_side)) = self.lost.take() {
             self.max_side = max_side;
         }
