@@ -1,4 +1,5 @@
 use std::collections::VecDeque;
+use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -211,7 +212,17 @@ fn warm_up(locator: &mut BatchLocator, batch: usize) -> Result<(), LocateError> 
     Ok(())
 }
 
+impl fmt::Debug for GpuEngine {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("GpuEngine")
+            .field("options", &self.options)
+            .field("under_way", &self.under_way)
+            .finish_non_exhaustive()
+    }
+}
+
 /// The cascades in plain Rust: a frame a submission, which it waits for.
+#[derive(Debug)]
 pub struct CpuEngine {
     locators: Vec<Locator>,
     output: Output,
