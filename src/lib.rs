@@ -19,6 +19,9 @@ pub mod recording;
 pub mod reference;
 pub mod verification;
 
+/// Crates whose types are in the API here, in the versions that it has them from.
+pub use {glam, image, wgpu};
+
 /// The examples in the documents are compiled with the tests.
 #[cfg(all(doctest, feature = "cli"))]
 #[doc = include_str!("../README.md")]

@@ -751,6 +751,46 @@ fn a_reader_that_leaves_early_is_no_failure() {
     assert_eq!(output.status.code(), Some(0));
 }
 
+/// Nobody reads stdout: what failed is still told, and files are still written.
+#[test]
+fn a_reader_that_leaves_changes_no_verdict_and_no_file() {
+    let bench = Bench::new();
+    bench.image("white.png", 96, 72, WHITE);
+    bench.image("other.png", 96, 72, WHITE);
+    let locate = |arguments: &[&str]| {
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        let status = std::process::Command::new(env!("CARGO_BIN_EXE_whereabot"))
+            .current_dir(bench.folder.path())
+            .args([
+                "locate",
+                "--adapter",
+                "cpu",
+                "--weights",
+                "model.safetensors",
+            ])
+            .args(arguments)
+            .stdout(writer)
+            .status()
+            .unwrap();
+        status.code()
+    };
+    assert_eq!(locate(&["missing.png", "white.png"]), Some(1));
+    assert_eq!(
+        locate(&["white.png", "missing.png", "--out", "all"]),
+        Some(1)
+    );
+    assert_eq!(locate(&["white.png", "other.png", "--out", "all"]), Some(0));
+    for name in ["white", "other"] {
+        assert!(
+            bench.path(&format!("all/{name}.mask.png")).exists(),
+            "{name}"
+        );
+    }
+    // Nothing is left to do where there are no files.
+    assert_eq!(locate(&["white.png", "missing.png"]), Some(0));
+}
+
 #[test]
 fn adapters_are_listed_with_the_one_that_would_be_used() {
     let bench = Bench::new();

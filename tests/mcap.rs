@@ -230,6 +230,7 @@ fn check(messages: &[Value], put: &Observation) -> Result<(), String> {
         Distortion::Rational { k, p } => ("plumb_bob", vec![k[0], k[1], p[0], p[1], k[2]]),
         Distortion::Equidistant { k } => ("equidistant", k.to_vec()),
         Distortion::None => ("plumb_bob", vec![0.0; 5]),
+        other => return Err(format!("not a case here: {other:?}")),
     };
     let expected = json!({
         "header": header, "height": put.view.height, "width": put.view.width,

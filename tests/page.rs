@@ -580,6 +580,36 @@ fn a_request_that_never_ends_is_cut_off() {
 }
 
 #[test]
+fn who_says_nothing_or_has_no_token_keeps_no_seat() {
+    let server = Server::bind("0.0.0.0:0", cameras()).unwrap();
+    let url = server.url();
+    let (host, path) = url.split_once("//").unwrap().1.split_once('/').unwrap();
+    let port = host.rsplit_once(':').unwrap().1;
+    let address: SocketAddr = format!("127.0.0.1:{port}").parse().unwrap();
+    let kept = |request: &str| {
+        let start = Instant::now();
+        let mut stream = connect(address);
+        stream.write_all(request.as_bytes()).unwrap();
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer).unwrap();
+        (String::from_utf8(answer).unwrap(), start.elapsed())
+    };
+    let get = |path: &str| format!("GET /{path}icon.svg HTTP/1.1\r\nHost: {host}\r\n\r\n");
+    let (answer, time) = kept("");
+    assert!(
+        answer.is_empty() && time < Duration::from_secs(4),
+        "{time:?}"
+    );
+    let (answer, time) = kept(&get(""));
+    assert!(answer.starts_with("HTTP/1.1 403"), "{answer}");
+    assert!(time < Duration::from_secs(4), "{time:?}");
+    // Negative control: who has the token may ask again.
+    let (answer, time) = kept(&get(path));
+    assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
+    assert!(time > Duration::from_secs(4), "{time:?}");
+}
+
+#[test]
 fn too_many_clients_are_turned_away_until_others_go() {
     let (_server, _, address) = page();
     let clients: Vec<_> = (0..64).map(|_| connect(address)).collect();

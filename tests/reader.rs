@@ -423,6 +423,18 @@ mod check {
         assert_eq!(line["fault_count"], 4);
         assert_eq!(line["faults"].as_array().unwrap().len(), 4);
 
+        // Also where nobody reads it.
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        let status = std::process::Command::new(env!("CARGO_BIN_EXE_whereabot"))
+            .current_dir(folder.0.path())
+            .args(["recording", "check", ".", "--sheet", "sheet.png"])
+            .stdout(writer)
+            .stderr(std::process::Stdio::null())
+            .status();
+        assert_eq!(status.unwrap().code(), Some(1));
+        assert!(folder.path("sheet.png").exists());
+
         let wrong = (0..50).map(|id| with(sample(id), "/coverage", Some(json!(2.0))));
         folder.write_lines(&wrong.collect::<Vec<_>>());
         let output = run(&["."], &folder);

@@ -187,6 +187,8 @@ fn wrong_usage_exits_with_2_and_missing_weights_with_1() {
             "{stderr}"
         );
     }
+    let (_, stderr, _) = run(folder.path(), &["--adapter", "cpu"]);
+    assert!(stderr.contains("Usage: whereabot verify"), "{stderr}");
     std::fs::remove_file(folder.path().join("model.safetensors")).unwrap();
     let (_, stderr, code) = run(folder.path(), &[]);
     assert_eq!(code, 1);

@@ -1041,7 +1041,14 @@ fn http(
     answers: Vec<&'static str>,
     gate: Option<Receiver<()>>,
 ) -> (String, Receiver<(String, Value)>) {
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    http_on(TcpListener::bind("127.0.0.1:0").unwrap(), answers, gate)
+}
+
+fn http_on(
+    listener: TcpListener,
+    answers: Vec<&'static str>,
+    gate: Option<Receiver<()>>,
+) -> (String, Receiver<(String, Value)>) {
     let url = format!("http://{}/alarm", listener.local_addr().unwrap());
     let (sender, requests) = mpsc::channel();
     thread::spawn(move || {
@@ -1430,6 +1437,40 @@ fn attempts_come_to_an_end() {
         !report.done && report.message.contains("connecting: "),
         "{report:?}"
     );
+}
+
+/// Nobody is at the port while the rule is unknown, which counts as a stop; then somebody is, and it really is a stop.
+#[test]
+fn what_failed_for_good_is_acted_on_again() {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap();
+    drop(listener);
+    let mut running = Running::new(&format!(
+        "unknown = \"stop\"\n[[action]]\nname = \"post\"\non = [\"stop\"]\npost = \"http://{address}/\"\nattempts = 2\n"
+    ));
+    let failed = [running.report(), running.report()];
+    let tried = failed.map(|report| (report.state, report.attempt, report.done));
+    assert_eq!(
+        tried,
+        [(State::Unknown, 1, false), (State::Unknown, 2, false)]
+    );
+    let listener = TcpListener::bind(address).unwrap();
+    let (_, requests) = http_on(listener, vec![OK; 2], None);
+    running.see(0.5);
+    let report = running.report();
+    assert!(report.done && report.state == State::Stop, "{report:?}");
+    // Now that it is done, unknown is no news, and nor is the stop behind it.
+    let stale = Event {
+        at: SystemTime::now(),
+        camera: Some(0),
+        kind: EventKind::Stale,
+    };
+    running.warnings.event(&stale);
+    running.see(0.5);
+    running.see(3.0);
+    while running.state() != State::Clear {}
+    requests.recv_timeout(SECOND).unwrap();
+    assert!(requests.recv_timeout(ms(300)).is_err());
 }
 
 /// A stop that the robot was not told yet is still told when it is clear again.

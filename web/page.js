@@ -199,6 +199,7 @@ async function usePicture(blob, extras, hfov) {
 async function useVideo(properties, extras, stop) {
   const video = Object.assign(document.createElement('video'), { muted: true, playsInline: true, loop: true, ...properties });
   await video.play().catch(() => {
+    stop();
     throw new Error('This browser cannot play that video.');
   });
   const stopped = () => {

@@ -2,6 +2,7 @@ use super::Intrinsics;
 
 /// Lens distortion, in the models of ROS `camera_info`.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[non_exhaustive]
 pub enum Distortion {
     /// A pinhole.
     #[default]

@@ -1,6 +1,5 @@
 //! `whereabot adapters`: what there is to run on.
 
-use std::io::{self, Write};
 use std::process::ExitCode;
 
 use serde_json::json;
@@ -25,7 +24,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     } else {
         as_table(&reports, &choice)
     };
-    io::stdout().lock().write_all(text.as_bytes())?;
+    super::print(&text)?;
     match choice {
         Ok(_) | Err(GpuError::NoAdapter { .. }) => Ok(ExitCode::SUCCESS),
         Err(error) => Err(error.into()),

@@ -8,7 +8,6 @@ use std::process::{ExitCode, Stdio};
 use std::time::Instant;
 
 use anyhow::{Context, anyhow, bail, ensure};
-use clap::CommandFactory;
 use clap::error::ErrorKind;
 use image::{ImageFormat, RgbImage, RgbaImage};
 use indicatif::ProgressBar;
@@ -38,7 +37,7 @@ pub struct Args {
     #[arg(long, value_name = "N,N,...", value_delimiter = ',',
           value_parser = clap::value_parser!(u32).range(1..))]
     batch: Vec<u32>,
-    /// What to compute in [default: f32]
+    /// What to store activations in; f16 is for GPUs [default: f32]
     #[arg(long, value_enum, value_name = "NAME,NAME", value_delimiter = ',')]
     precision: Vec<PrecisionName>,
     /// How often each batch is measured [default: for three seconds, 3 to 500 times]
@@ -77,7 +76,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if let [old, new] = earlier.as_slice() {
         args.refuse_measuring();
         let text = compare((&name(0), &name(1)), old, new);
-        io::stdout().lock().write_all(text.as_bytes())?;
+        super::print(&text)?;
         return Ok(ExitCode::SUCCESS);
     }
     let json = args.json.as_deref();
@@ -99,10 +98,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let figures = format!("{}\n", serde_json::to_string_pretty(&report)?);
     if to_stdout {
-        io::stderr().lock().write_all(text.as_bytes())?;
-        io::stdout().lock().write_all(figures.as_bytes())?;
+        // Nobody is left to tell where stderr is gone too.
+        let _ = io::stderr().lock().write_all(text.as_bytes());
+        super::print(&figures)?;
     } else {
-        io::stdout().lock().write_all(text.as_bytes())?;
+        super::print(&text)?;
     }
     if let Some(file) = json.filter(|_| !to_stdout) {
         OpenOptions::new()
@@ -165,9 +165,7 @@ impl Args {
             let message = format!(
                 "the argument '{flag}' cannot be used with two files to '--compare': nothing is measured"
             );
-            super::Command::command()
-                .error(ErrorKind::ArgumentConflict, message)
-                .exit();
+            super::refuse("bench", ErrorKind::ArgumentConflict, &message);
         }
     }
 
@@ -253,7 +251,7 @@ fn first_result(args: &Args) -> anyhow::Result<ExitCode> {
     let mut locator = engine::locator(&model, device.as_ref(), Precision::F32)?;
     let image = RgbaImage::new(640, 480);
     locator.locate(&image, &Camera::assumed(640, 480), Output::default())?;
-    writeln!(io::stdout().lock(), "done")?;
+    super::print("done\n")?;
     Ok(ExitCode::SUCCESS)
 }
 

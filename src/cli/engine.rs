@@ -20,8 +20,8 @@ pub(super) struct EngineArgs {
     /// The backends to search: vulkan, metal, dx12, gl
     #[arg(long, value_name = "NAME")]
     pub backend: Option<String>,
-    /// Do not look for the fastest kernels on this adapter, which takes some five seconds and is
-    /// remembered in the user's cache folder
+    /// Skip the search for the fastest kernels (some five seconds when a GPU is first used; the result is kept in
+    /// the user's cache folder)
     #[arg(long)]
     pub no_tuning: bool,
 }
@@ -142,7 +142,7 @@ fn cache_file(device: &Device, name: FileName) -> Option<PathBuf> {
     Some(folder.join(format!("{begin}-{adapter}.{end}")))
 }
 
-/// What to compute in.
+/// What to store activations in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(super) enum PrecisionName {
     F32,

@@ -1,7 +1,6 @@
 //! `whereabot info`: a model file's card.
 
 use std::fmt::Write as _;
-use std::io::{self, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -37,7 +36,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     } else {
         card(&model, bytes.len())
     };
-    io::stdout().lock().write_all(text.as_bytes())?;
+    super::print(&text)?;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -85,16 +85,20 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
         let located = found.and_then(|()| locate(&args, camera, &mut engine, &path, &mut stems));
         failed |= located.is_err();
         // The bar and the lines may share a terminal.
-        progress.suspend(|| match located {
+        let is_read = progress.suspend(|| match located {
             Ok(located) => print(&located.line(args.json)?),
             Err(error) if args.json => print(&error_line(&path, &error)?),
             Err(error) => {
                 // Nobody is left to tell where stderr is gone too.
                 let _ = writeln!(io::stderr(), "{}: error: {error:#}", path.display());
-                Ok(())
+                Ok(true)
             }
         })?;
         progress.inc(1);
+        // Pictures are wanted still where they are.
+        if !is_read && args.out.is_none() {
+            break;
+        }
     }
     progress.finish_and_clear();
     Ok(if failed {
@@ -104,8 +108,8 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
     })
 }
 
-fn print(line: &str) -> anyhow::Result<()> {
-    Ok(writeln!(io::stdout().lock(), "{line}")?)
+fn print(line: &str) -> anyhow::Result<bool> {
+    Ok(super::print(&format!("{line}\n"))?)
 }
 
 /// The images of the inputs, and the inputs that are none.

@@ -17,7 +17,8 @@ mod weights;
 use std::io::{self, Write};
 use std::process::ExitCode;
 
-use clap::Parser;
+use clap::error::ErrorKind;
+use clap::{CommandFactory, Parser};
 
 use crate::gpu::GpuError;
 
@@ -59,10 +60,6 @@ pub fn main() -> ExitCode {
         Command::Recording(args) => recording::run(&args),
     };
     done.unwrap_or_else(|error| {
-        if is_broken_pipe(&error) {
-            // The reader, such as `head`, has what it wanted.
-            return ExitCode::SUCCESS;
-        }
         // Nobody is left to tell where stderr is gone too.
         let _ = writeln!(io::stderr(), "error: {error:#}");
         if is_wrong_usage(&error) {
@@ -73,10 +70,24 @@ pub fn main() -> ExitCode {
     })
 }
 
-fn is_broken_pipe(error: &anyhow::Error) -> bool {
-    error
-        .downcast_ref::<io::Error>()
-        .is_some_and(|e| e.kind() == io::ErrorKind::BrokenPipe)
+/// Writes to stdout; whether somebody reads it. A reader that left, such as `head`, has what it wanted: nothing fails for that, and
+/// files are written and verdicts given all the same.
+fn print(text: &str) -> io::Result<bool> {
+    match io::stdout().lock().write_all(text.as_bytes()) {
+        Ok(()) => Ok(true),
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
+        Err(error) => Err(error),
+    }
+}
+
+/// Ends the program over a wrong usage of `subcommand`, as clap does.
+fn refuse(subcommand: &str, kind: ErrorKind, message: &str) -> ! {
+    let mut command = Command::command();
+    command.build();
+    match command.find_subcommand_mut(subcommand) {
+        Some(subcommand) => subcommand.error(kind, message).exit(),
+        None => command.error(kind, message).exit(),
+    }
 }
 
 fn is_wrong_usage(error: &anyhow::Error) -> bool {

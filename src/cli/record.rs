@@ -3,8 +3,7 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::{Context, bail};
-use clap::CommandFactory;
+use anyhow::Context;
 use clap::error::ErrorKind;
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -38,7 +37,7 @@ pub struct Args {
     /// How many samples the recording shall have
     #[arg(long, value_name = "N", required_unless_present = "paper")]
     samples: Option<u64>,
-    /// What the samples are drawn from
+    /// Seed of the random numbers: the same seed gives the same samples
     #[arg(long, value_name = "S")]
     seed: u64,
     /// The recording's folder; with --paper the folder of the nine recordings' folders
@@ -144,14 +143,7 @@ fn paper_urdfs(named: &[PathBuf]) -> Result<[PathBuf; 3], String> {
 pub fn run(args: Args) -> anyhow::Result<ExitCode> {
     let requests = match requests(args) {
         Ok(requests) => requests,
-        Err(message) => {
-            let mut command = super::Command::command();
-            command.build();
-            let Some(record) = command.find_subcommand_mut("record") else {
-                bail!(message);
-            };
-            record.error(ErrorKind::ValueValidation, message).exit();
-        }
+        Err(message) => super::refuse("record", ErrorKind::ValueValidation, &message),
     };
     if requests.len() > 1 {
         // What is wrong with the last robot shall not be told after hours.

@@ -83,16 +83,16 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 if checked.faults.len() > TOLD {
                     tell(&format!("and {} more", checked.faults.len() - TOLD));
                 }
-                writeln!(io::stdout().lock(), "{text}")
+                super::print(&format!("{text}\n"))
             }
             Err(error) => {
                 failed = true;
                 tell(&format!("error: {error}"));
                 if args.json {
                     let line = json!({"schema": 1, "recording": folder, "faults": [error.to_string()], "fault_count": 1});
-                    return writeln!(io::stdout().lock(), "{line}");
+                    return super::print(&format!("{line}\n"));
                 }
-                Ok(())
+                Ok(true)
             }
         })?;
     }

@@ -1,12 +1,10 @@
 //! `whereabot verify`: whether this adapter computes what plain Rust computes.
 
 use std::fs;
-use std::io::{self, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Context;
-use clap::CommandFactory;
 use clap::error::ErrorKind;
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -40,9 +38,7 @@ pub struct Args {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.engine.is_cpu() {
         let message = "`--adapter cpu` is plain Rust, what adapters are held to";
-        super::Command::command()
-            .error(ErrorKind::ArgumentConflict, message)
-            .exit();
+        super::refuse("verify", ErrorKind::ArgumentConflict, message);
     }
     let file = weights::path(None, args.weights.as_deref())?;
     let bytes = fs::read(&file).with_context(|| format!("{}: cannot be read", file.display()))?;
@@ -80,7 +76,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     } else {
         report.to_string()
     };
-    io::stdout().lock().write_all(text.as_bytes())?;
+    super::print(&text)?;
     Ok(match report.verdict {
         Verdict::Agrees => ExitCode::SUCCESS,
         Verdict::Disagrees => ExitCode::FAILURE,

@@ -164,6 +164,8 @@ fn sinks(
         let fusion = Fusion::new(number, &rig.cameras, rig.options, rig.smoothing_s, fused);
         sinks.push(Box::new(fusion));
     }
+    let recorder = recorder(args, cameras, models)?;
+    // After all that may fail: at their start nothing is known, and that is acted on.
     if !config.warnings.rules.is_empty() {
         let observers: Vec<_> = cameras.iter().map(CameraConfig::observer).collect();
         let say = say.clone();
@@ -175,20 +177,30 @@ fn sinks(
             emit,
         )?));
     }
-    if let Some(file) = &args.record {
-        let recorded = cameras.iter().map(|camera| {
-            let description = models.description(camera.robot.place)?;
-            Some(RecordedCamera {
-                name: camera.name.clone(),
-                robot: description.robot.clone(),
-                joints: description.joints.clone(),
-                canonical: description.camera,
-            })
-        });
-        let recorded: Vec<_> = recorded.flatten().collect();
-        sinks.push(Box::new(Recorder::create(file, &recorded)?));
-    }
+    sinks.extend(recorder.map(|recorder| Box::new(recorder) as _));
     Ok(sinks)
+}
+
+/// The file of what cameras saw, where there is to be one.
+fn recorder(
+    args: &Args,
+    cameras: &[CameraConfig],
+    models: &Models,
+) -> anyhow::Result<Option<Recorder>> {
+    let Some(file) = &args.record else {
+        return Ok(None);
+    };
+    let recorded = cameras.iter().map(|camera| {
+        let description = models.description(camera.robot.place)?;
+        Some(RecordedCamera {
+            name: camera.name.clone(),
+            robot: description.robot.clone(),
+            joints: description.joints.clone(),
+            canonical: description.camera,
+        })
+    });
+    let recorded: Vec<_> = recorded.flatten().collect();
+    Ok(Some(Recorder::create(file, &recorded)?))
 }
 
 /// The page, where there is to be one.

@@ -9,6 +9,7 @@ use super::{Device, GpuError, Layout, Tier};
 
 /// A kernel for convolutions, named after its file in `shaders/`. None is best everywhere.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[non_exhaustive]
 pub enum Conv2dKernel {
     /// Between textures to one channel, weights spread by subgroups: for CPU rasterisers.
     SubgroupOne,

@@ -3,6 +3,7 @@ use super::{Device, GpuError};
 /// What holds a camera's image on the GPU. Each view is of one mip level and one layer, and its texture
 /// has `TEXTURE_BINDING` among its usages.
 #[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
 pub enum Planes {
     /// A texture of `rgba8unorm`, `bgra8unorm` (colours as the camera encoded them) or one of these with
     /// `-srgb` (which gives linear light); alpha is ignored. Its texture's format counts: give a view

@@ -1,4 +1,5 @@
 use std::collections::VecDeque;
+use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -24,14 +25,15 @@ pub trait Engine: Send {
     /// [`IN_FLIGHT`] submissions are ever on their way. Does not wait for the answers.
     ///
     /// # Errors
-    /// A device that was lost: nothing on its way will be answered.
+    /// [`GpuError::Lost`], [`GpuError::Timeout`] and [`GpuError::Driver`]: nothing on its way will be answered. Any other is of
+    /// these frames alone: they are not submitted, and what is on its way is answered.
     fn submit(&mut self, robot: usize, frames: &[Frame]) -> Result<(), LocateError>;
 
     /// What was found in the frames of the oldest submission, in their order; `None` while it is on its way.
     /// Never waits.
     ///
     /// # Errors
-    /// As [`Engine::submit`].
+    /// A device that was lost or has another fault, also while nothing is on its way: nothing will be answered.
     fn finished(&mut self) -> Result<Option<Vec<Estimate>>, LocateError>;
 
     /// Forgets everything that is on its way, and opens the device again.
@@ -132,9 +134,8 @@ impl Engine for GpuEngine {
     }
 
     fn finished(&mut self) -> Result<Option<Vec<Estimate>>, LocateError> {
-        let Some(&(robot, place)) = self.under_way.front() else {
-            return Ok(None);
-        };
+        // Where nothing is on its way, any of them knows whether the device has a fault.
+        let (robot, place) = self.under_way.front().copied().unwrap_or_default();
         let locator = self.robots.get_mut(robot).and_then(|r| r.get_mut(place));
         let finished = match locator {
             Some((_, locator)) => locator.finished()?,
@@ -211,7 +212,17 @@ fn warm_up(locator: &mut BatchLocator, batch: usize) -> Result<(), LocateError> 
     Ok(())
 }
 
+impl fmt::Debug for GpuEngine {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("GpuEngine")
+            .field("options", &self.options)
+            .field("under_way", &self.under_way)
+            .finish_non_exhaustive()
+    }
+}
+
 /// The cascades in plain Rust: a frame a submission, which it waits for.
+#[derive(Debug)]
 pub struct CpuEngine {
     locators: Vec<Locator>,
     output: Output,

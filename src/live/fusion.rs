@@ -1,3 +1,4 @@
+use std::fmt;
 use std::time::{Instant, UNIX_EPOCH};
 
 use glam::DVec3;
@@ -32,6 +33,15 @@ pub struct Fusion<F> {
     started: Option<Instant>,
     smoother: Option<Smoother>,
     fused: F,
+}
+
+impl<F> fmt::Debug for Fusion<F> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Fusion")
+            .field("number", &self.number)
+            .field("rig", &self.rig)
+            .finish_non_exhaustive()
+    }
 }
 
 impl<F: FnMut(Fused) + Send> Fusion<F> {

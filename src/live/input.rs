@@ -1,3 +1,5 @@
+use std::fmt;
+
 use crate::camera::{Camera, CameraError, Orientation};
 
 use super::Source;
@@ -12,6 +14,16 @@ pub struct Input {
     pub orientation: Orientation,
     /// The robot in view: its place among the engine's models.
     pub robot: usize,
+}
+
+impl fmt::Debug for Input {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Input")
+            .field("calibration", &self.calibration)
+            .field("orientation", &self.orientation)
+            .field("robot", &self.robot)
+            .finish_non_exhaustive()
+    }
 }
 
 /// The camera of images as a source gives them, before they are made upright.

@@ -15,6 +15,7 @@ use crate::cascade::EstimateLine;
 ///
 /// A thread of its own writes them, each line with one write. Where whoever reads them is too slow, lines are lost,
 /// and the next line of statistics says how many.
+#[derive(Debug)]
 pub struct Lines {
     cameras: Vec<Named>,
     rigs: Vec<NamedRig>,

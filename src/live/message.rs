@@ -1,3 +1,4 @@
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use super::Observation;
@@ -16,9 +17,23 @@ pub(super) enum Message {
     /// A source came to its end.
     Ended { camera: usize },
     /// A frame was searched.
-    Answered(Box<Observation>),
+    Answered(Answer),
     /// The GPU failed.
     DeviceLost { reason: String },
     /// The GPU is back.
     DeviceBack,
+}
+
+/// What was found in a frame, for the first who takes it.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Answer(Arc<Mutex<Option<Box<Observation>>>>);
+
+impl Answer {
+    pub fn new(observation: Observation) -> Self {
+        Self(Arc::new(Mutex::new(Some(Box::new(observation)))))
+    }
+
+    pub fn take(&self) -> Option<Box<Observation>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).take()
+    }
 }

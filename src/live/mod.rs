@@ -8,6 +8,7 @@ mod config;
 mod engine;
 mod frame;
 mod fusion;
+mod guard;
 mod input;
 mod lines;
 mod mailbox;

@@ -55,7 +55,7 @@ pub enum EventKind {
     Live,
     /// No frame for longer than two frame periods and 100 ms.
     Stale,
-    /// Its source failed, and is opened again after `retry_in`.
+    /// Its source failed, or its frames cannot be searched; it is tried again after `retry_in`.
     Failed {
         /// Why.
         reason: String,
@@ -84,8 +84,8 @@ pub struct Rates {
     pub frames_per_s: f64,
     /// Answers, a second.
     pub answers_per_s: f64,
-    /// Frames that got no answer, since the start: replaced by newer ones before they were searched, or under way
-    /// when a device was lost.
+    /// Frames that got no answer, since the start: replaced by newer ones before they were searched, refused by the
+    /// engine, under way when a device was lost, or answered while a sink made the answer before them wait.
     pub dropped: u64,
     /// Median of the answers' ages.
     pub age_p50: Option<Duration>,
@@ -104,6 +104,7 @@ pub struct Statistics {
 
 /// What a sink has to say to all others.
 #[derive(Debug, Clone)]
+#[non_exhaustive]
 pub enum Word {
     /// Something happened.
     Event(Event),

@@ -1,10 +1,12 @@
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
 use image::RgbaImage;
 
 use super::frame::{Pool, resize};
+use super::guard::guarded;
 use super::mailbox::Mailboxes;
 use super::message::Message;
 use super::{Frame, Input, SourceError, Stop, Stream};
@@ -14,8 +16,8 @@ use crate::camera::{Camera, Crop, Orientation, Texels};
 pub(super) struct Reader {
     pub camera: usize,
     pub input: Input,
-    /// The longest side that the engine takes, in pixels.
-    pub max_side: u32,
+    /// The longest side that the engine takes now, in pixels.
+    pub max_side: Arc<AtomicU32>,
     pub mailboxes: Arc<Mailboxes>,
     pub messages: Sender<Message>,
     pub stop: Arc<Stop>,
@@ -35,7 +37,7 @@ impl Reader {
     pub fn run(mut self) {
         let mut memory = Memory::default();
         let mut patience = Patience::default();
-        while let Err(error) = self.read(&mut memory, &mut patience) {
+        while let Err(error) = self.guarded_read(&mut memory, &mut patience) {
             if self.stop.is_set() || self.wait(&error, &mut patience) {
                 break;
             }
@@ -45,7 +47,16 @@ impl Reader {
                 camera: self.camera,
             });
         }
-        self.mailboxes.close();
+    }
+
+    /// A source may be somebody else's.
+    fn guarded_read(
+        &mut self,
+        memory: &mut Memory,
+        patience: &mut Patience,
+    ) -> Result<(), SourceError> {
+        let read = guarded(|| self.read(memory, patience));
+        read.unwrap_or_else(|words| Err(SourceError::Panicked(words)))
     }
 
     /// Opens the source and reads it to its end.
@@ -99,17 +110,18 @@ impl Reader {
         let number = memory.number;
         memory.number += 1;
         let camera = match shot.camera {
-            Some(camera) => camera,
+            Some(camera) => camera.for_image(stored.width(), stored.height())?,
             None => self
                 .input
                 .calibration
                 .camera(stored.width(), stored.height())?,
         };
         let longest = camera.width.max(camera.height);
-        if longest > self.max_side || camera.width.min(camera.height) == 0 {
+        let max_side = self.max_side.load(Ordering::Relaxed);
+        if longest > max_side || camera.width.min(camera.height) == 0 {
             return Err(SourceError::Frame(format!(
-                "expected an image of 1 to {} pixels on a side, found {} x {}",
-                self.max_side, camera.width, camera.height
+                "expected an image of 1 to {max_side} pixels on a side, found {} x {}",
+                camera.width, camera.height
             )));
         }
         if !upright {
@@ -140,6 +152,13 @@ impl Reader {
     fn tell(&self, message: Message) {
         // Nobody listens any more when everything stops.
         let _ = self.messages.send(message);
+    }
+}
+
+impl Drop for Reader {
+    /// However it ends: who waits for frames waits for no more of this camera.
+    fn drop(&mut self) {
+        self.mailboxes.close();
     }
 }
 

@@ -1,11 +1,13 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
 use super::engine::{Engine, IN_FLIGHT};
+use super::guard::guarded;
 use super::mailbox::{Mail, Mailboxes};
-use super::message::Message;
+use super::message::{Answer, Message};
 use super::service::Service;
 use super::{Frame, Observation, Stop};
 use crate::cascade::{Estimate, LocateError};
@@ -18,18 +20,35 @@ pub(super) struct Scheduler {
     engine: Box<dyn Engine>,
     /// Each camera's robot.
     robots: Vec<usize>,
+    /// The longest side that the engine takes now, in pixels, for the readers.
+    max_side: Arc<AtomicU32>,
     mailboxes: Arc<Mailboxes>,
     messages: Sender<Message>,
     stop: Arc<Stop>,
     /// In which round each camera was served last.
     served: Vec<u64>,
+    /// Of each camera.
+    trust: Vec<Trust>,
     round: u64,
     under_way: VecDeque<Submission>,
     service: Service,
+    /// Each camera's last answer, which nobody may have looked at yet.
+    answers: Vec<Answer>,
     /// How long to wait before a device is opened again: not at all after an answer.
     patience: Duration,
     /// Used again each time: the cameras that have a frame.
     fresh: Vec<usize>,
+}
+
+/// What is known of a camera's frames since its last answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Trust {
+    /// Nothing bad.
+    Full,
+    /// One was in a submission of several that the engine refused: it may be the one to blame, so the next goes alone.
+    Alone,
+    /// One was refused alone, and that is told. They still go alone.
+    Refused,
 }
 
 struct Submission {
@@ -48,6 +67,7 @@ impl Scheduler {
     pub fn new(
         engine: Box<dyn Engine>,
         robots: Vec<usize>,
+        max_side: Arc<AtomicU32>,
         mailboxes: Arc<Mailboxes>,
         messages: Sender<Message>,
         stop: Arc<Stop>,
@@ -55,8 +75,11 @@ impl Scheduler {
         Self {
             engine,
             served: vec![0; robots.len()],
+            answers: robots.iter().map(|_| Answer::default()).collect(),
+            trust: vec![Trust::Full; robots.len()],
             fresh: Vec::with_capacity(robots.len()),
             robots,
+            max_side,
             mailboxes,
             messages,
             stop,
@@ -70,10 +93,12 @@ impl Scheduler {
     /// Until everything is to stop, or no camera has more frames and all are answered.
     pub fn run(mut self) {
         while !self.stop.is_set() {
-            match self.step() {
-                Ok(true) => {}
-                Ok(false) => return,
-                Err(error) => self.recover(&error),
+            // wgpu panics over some devices that are lost.
+            match guarded(|| self.step()) {
+                Ok(Ok(true)) => {}
+                Ok(Ok(false)) => return,
+                Ok(Err(error)) => self.recover(error.to_string()),
+                Err(words) => self.recover(format!("the engine panicked: {words}")),
             }
         }
     }
@@ -115,11 +140,18 @@ impl Scheduler {
         self.mailboxes.fresh(&mut self.fresh);
         let served = &self.served;
         self.fresh.sort_by_key(|&camera| served.get(camera));
-        let robot = |camera: &usize| self.robots.get(*camera).copied().unwrap_or_default();
-        let Some(first) = self.fresh.first().map(robot) else {
+        let Some(&oldest) = self.fresh.first() else {
             return Ok(());
         };
-        self.fresh.retain(|camera| robot(camera) == first);
+        let robot = |camera: usize| self.robots.get(camera).copied().unwrap_or_default();
+        let first = robot(oldest);
+        let trusted = |camera: usize| self.trust.get(camera) == Some(&Trust::Full);
+        if trusted(oldest) {
+            self.fresh
+                .retain(|&camera| robot(camera) == first && trusted(camera));
+        } else {
+            self.fresh.truncate(1);
+        }
         self.fresh
             .truncate(self.engine.batch(first, self.fresh.len()));
         self.round += 1;
@@ -136,11 +168,41 @@ impl Scheduler {
             submitted: begun,
         });
         if let Some(submission) = self.under_way.back_mut() {
-            self.engine.submit(first, &submission.frames)?;
-            submission.submitted = Instant::now();
-            self.service.submitted(submission.submitted - begun);
+            match self.engine.submit(first, &submission.frames) {
+                Ok(()) => {
+                    submission.submitted = Instant::now();
+                    self.service.submitted(submission.submitted - begun);
+                }
+                Err(error) if is_of_device(&error) => return Err(error),
+                Err(error) => self.refused(&error),
+            }
         }
         Ok(())
+    }
+
+    /// The engine did not take the newest submission. What is on its way does not suffer.
+    fn refused(&mut self, error: &LocateError) {
+        let frames = self
+            .under_way
+            .pop_back()
+            .map_or_else(Vec::new, |s| s.frames);
+        let alone = frames.len() == 1;
+        for frame in frames {
+            self.mailboxes.lose(frame.camera);
+            let Some(trust) = self.trust.get_mut(frame.camera) else {
+                continue;
+            };
+            let now = if alone { Trust::Refused } else { Trust::Alone };
+            let before = std::mem::replace(trust, now);
+            if alone && before != Trust::Refused {
+                self.tell(Message::Failed {
+                    camera: frame.camera,
+                    reason: error.to_string(),
+                    // With the next frame.
+                    retry_in: Duration::ZERO,
+                });
+            }
+        }
     }
 
     /// Tells what was found in the oldest submission.
@@ -154,7 +216,10 @@ impl Scheduler {
         self.service
             .finished(submission.submitted, count, answered_at);
         for (frame, estimate) in submission.frames.into_iter().zip(estimates) {
-            self.tell(Message::Answered(Box::new(Observation {
+            if let Some(trust) = self.trust.get_mut(frame.camera) {
+                *trust = Trust::Full;
+            }
+            self.publish(Observation {
                 camera: frame.camera,
                 frame: frame.number,
                 acquired: frame.acquired,
@@ -163,27 +228,44 @@ impl Scheduler {
                 image: frame.image,
                 view: frame.view,
                 estimate,
-            })));
+            });
+        }
+    }
+
+    /// Takes the place of an answer of the same camera that nobody looked at: a sink that waits does not fill the memory.
+    fn publish(&mut self, observation: Observation) {
+        let camera = observation.camera;
+        let answer = Answer::new(observation);
+        self.tell(Message::Answered(answer.clone()));
+        if let Some(last) = self.answers.get_mut(camera)
+            && std::mem::replace(last, answer).take().is_some()
+        {
+            self.mailboxes.lose(camera);
         }
     }
 
     /// Opens the device again; what was under way is lost.
-    fn recover(&mut self, error: &LocateError) {
+    fn recover(&mut self, reason: String) {
         for frame in self.under_way.drain(..).flat_map(|s| s.frames) {
             self.mailboxes.lose(frame.camera);
         }
         self.service = Service::default();
-        self.tell(Message::DeviceLost {
-            reason: error.to_string(),
-        });
+        self.tell(Message::DeviceLost { reason });
         loop {
             if !self.patience.is_zero() && self.stop.wait(self.patience) {
                 return;
             }
             self.patience = (2 * self.patience).clamp(Self::RETRY, Self::RETRY_MOST);
-            match self.engine.reopen() {
-                Ok(()) => return self.tell(Message::DeviceBack),
-                Err(error) => log::warn!("no device: {error}; tried again in {:?}", self.patience),
+            let opened = guarded(|| self.engine.reopen());
+            match opened.and_then(|opened| opened.map_err(|error| error.to_string())) {
+                Ok(()) => {
+                    self.max_side
+                        .store(self.engine.max_side(), Ordering::Relaxed);
+                    return self.tell(Message::DeviceBack);
+                }
+                Err(reason) => {
+                    log::warn!("no device: {reason}; tried again in {:?}", self.patience);
+                }
             }
         }
     }
@@ -192,4 +274,11 @@ impl Scheduler {
         // Nobody listens any more when everything stops.
         let _ = self.messages.send(message);
     }
+}
+
+/// Whether a submission failed by the device, which is to be opened again then; else by the frames themselves. A device that has a
+/// fault says so in [`Engine::finished`], too.
+fn is_of_device(error: &LocateError) -> bool {
+    use GpuError::{Driver, Lost, Timeout};
+    matches!(error, LocateError::Gpu(Lost(_) | Timeout(_) | Driver(_)))
 }

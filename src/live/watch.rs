@@ -1,4 +1,5 @@
 use std::sync::Arc;
+use std::sync::atomic::AtomicU32;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::thread;
 use std::time::{Duration, Instant, SystemTime};
@@ -24,13 +25,14 @@ pub fn watch(
     stop: &Arc<Stop>,
 ) -> Vec<SinkError> {
     let mailboxes = Arc::new(Mailboxes::new(inputs.len()));
-    let max_side = engine.max_side();
+    let max_side = Arc::new(AtomicU32::new(engine.max_side()));
     let (sender, messages) = channel();
     let robots = inputs.iter().map(|input| input.robot).collect();
     let pulses = inputs.iter().map(|_| Pulse::default()).collect();
     let scheduler = Scheduler::new(
         engine,
         robots,
+        Arc::clone(&max_side),
         Arc::clone(&mailboxes),
         sender.clone(),
         Arc::clone(stop),
@@ -40,7 +42,7 @@ pub fn watch(
         let reader = Reader {
             camera,
             input,
-            max_side,
+            max_side: Arc::clone(&max_side),
             mailboxes: Arc::clone(&mailboxes),
             messages: sender.clone(),
             stop: Arc::clone(stop),
@@ -159,7 +161,11 @@ impl Desk {
                 self.silence(camera);
                 self.event(Some(camera), EventKind::Ended);
             }
-            Message::Answered(observation) => {
+            Message::Answered(answer) => {
+                // A newer one is on its way where there is none.
+                let Some(observation) = answer.take() else {
+                    return;
+                };
                 if let Some(pulse) = self.pulses.get_mut(observation.camera) {
                     pulse.answered(observation.age());
                 }

@@ -17,6 +17,7 @@ pub enum Activation {
 
 /// What a layer computes. Weights are laid out as PyTorch has them.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
 pub enum Operation {
     /// Cross-correlation with stride 1 and zero padding 'same'; weight `[out, in, kernel, kernel]`,
     /// bias `[out]`.

@@ -150,6 +150,24 @@ fn what_cannot_start_leaves_no_file() {
     assert_eq!(record("cpu"), (Some(0), true));
 }
 
+/// Warnings act as soon as they start.
+#[test]
+fn what_cannot_start_does_nothing() {
+    let warning = "[[warning]]\nname = \"near\"\ncameras = [\"left\"]\nprotect = \"camera\"\nwarn_m = 2\nstop_m = 1\n\
+                   uncertainty_m = 0.1\n[[action]]\nname = \"act\"\non = [\"warn\"]\ncommand = [\"touch\", \"acted\"]\n";
+    let folder = folder(&(PHOTOS.to_owned() + warning));
+    sources::folder(&folder.path().join("photos"), 2);
+    let record = |file: &str| {
+        let mut command = command(folder.path());
+        command.args(["cameras.toml", "--adapter", "cpu", "--record", file]);
+        let code = command.output().unwrap().status.code();
+        (code, folder.path().join("acted").exists())
+    };
+    std::fs::write(folder.path().join("taken.mcap"), b"").unwrap();
+    assert_eq!(record("taken.mcap"), (Some(1), false));
+    assert_eq!(record("new.mcap"), (Some(0), true));
+}
+
 #[test]
 fn cameras_can_do_without_a_file() {
     let folder = folder("");

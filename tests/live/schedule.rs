@@ -4,7 +4,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::simulated::{Collector, Simulated, StandIn, watch};
-use whereabot::live::{EventKind, Input, Observation, Stop};
+use whereabot::camera::Camera;
+use whereabot::live::{Event, EventKind, Input, Observation, Sink, Statistics, Stop};
 
 const MS: Duration = Duration::from_millis(1);
 
@@ -121,6 +122,200 @@ fn frames_that_the_engine_cannot_take_are_their_camera_s_failure() {
         reason.contains("1 to 63 pixels on a side, found 64 x 48"),
         "{reason}"
     );
+}
+
+/// Each camera's failures.
+fn failures(collector: &Collector) -> Vec<(Option<usize>, String)> {
+    let events = collector.events().into_iter();
+    let failures = events.filter_map(|(camera, kind)| match kind {
+        EventKind::Failed { reason, .. } => Some((camera, reason)),
+        _ => None,
+    });
+    failures.collect()
+}
+
+fn losses(collector: &Collector) -> usize {
+    let lost = |(_, kind): &(_, EventKind)| matches!(kind, EventKind::DeviceLost { .. });
+    collector
+        .events()
+        .iter()
+        .filter(|event| lost(event))
+        .count()
+}
+
+#[test]
+fn a_frame_that_is_not_its_camera_s_is_that_camera_s_failure() {
+    let run = |width| {
+        let wrong = Simulated {
+            camera: Some(Camera::from_hfov(width, 48, 1.2)),
+            ..Simulated::new(20 * MS, 2)
+        };
+        run(
+            vec![wrong.input(), Simulated::new(100 * MS, 3).input()],
+            StandIn::new(MS, 2),
+        )
+    };
+    let collector = run(65);
+    assert_eq!(answers(&collector.observations(), 2), [0, 3]);
+    let (camera, reason) = &failures(&collector)[0];
+    assert_eq!(*camera, Some(0));
+    assert!(
+        reason.contains("65 x 48") && reason.contains("64 x 48"),
+        "{reason}"
+    );
+    // Negative control: the right camera.
+    let collector = run(64);
+    assert!(answers(&collector.observations(), 2)[0] > 0);
+    assert_eq!(failures(&collector), []);
+}
+
+#[test]
+fn frames_that_the_engine_refuses_are_their_camera_s_failure() {
+    let run = |refuses| {
+        let mut engine = StandIn::new(5 * MS, 3);
+        engine.refuses = refuses;
+        let cameras = (0..3).map(|_| Simulated::new(100 * MS, 12).input());
+        run(cameras.collect(), engine)
+    };
+    let collector = run(Some(1));
+    let counts = answers(&collector.observations(), 3);
+    // A frame or two are lost while it is found out whose fault it is.
+    assert!(
+        counts[0] >= 8 && counts[1] == 0 && counts[2] >= 8,
+        "{counts:?}"
+    );
+    assert_eq!(losses(&collector), 0);
+    // Told once.
+    let told = failures(&collector);
+    assert_eq!(told.len(), 1, "{told:?}");
+    assert_eq!(told[0].0, Some(1));
+    assert!(told[0].1.contains("no place for that"), "{told:?}");
+    let dropped = collector.statistics().last().unwrap().cameras[1].dropped;
+    assert!(dropped > 5, "{dropped}");
+    // Negative control: nothing is refused.
+    let collector = run(None);
+    assert!(answers(&collector.observations(), 3)[1] > 0);
+    assert_eq!(failures(&collector), []);
+}
+
+#[test]
+fn a_source_that_panics_has_failed() {
+    let run = |panics_at| {
+        let broken = Simulated {
+            panics_at,
+            ..Simulated::new(20 * MS, 3)
+        };
+        let stop = Arc::new(Stop::default());
+        let collector = Collector::default();
+        let sinks = vec![Box::new(collector.clone()) as _];
+        let cameras = vec![broken.input(), Simulated::new(100 * MS, 5).input()];
+        let stopper = {
+            let (stop, collector) = (Arc::clone(&stop), collector.clone());
+            // It would be opened again and again.
+            std::thread::spawn(move || {
+                while failures(&collector).len() < 2 && !stop.wait(20 * MS) {}
+                stop.set();
+            })
+        };
+        watch(cameras, Box::new(StandIn::new(MS, 2)), sinks, &stop);
+        stop.set();
+        stopper.join().unwrap();
+        collector
+    };
+    let collector = run(Some(1));
+    let (camera, reason) = &failures(&collector)[0];
+    assert_eq!(*camera, Some(0));
+    assert!(reason.contains("this source is broken"), "{reason}");
+    // The frame before came, and the other camera was answered all the time.
+    let counts = answers(&collector.observations(), 2);
+    assert!(counts[0] >= 1 && counts[1] >= 2, "{counts:?}");
+    // Negative control: the last frame is not reached.
+    assert_eq!(failures(&run(Some(3))), []);
+}
+
+#[test]
+fn an_engine_that_panics_is_a_device_that_is_lost() {
+    let mut engine = StandIn::new(5 * MS, 1);
+    engine.panics = Some(3);
+    let collector = run(vec![Simulated::new(50 * MS, 20).input()], engine);
+    let events = collector.events();
+    let lost = events.iter().find_map(|(_, kind)| match kind {
+        EventKind::DeviceLost { reason } => Some(reason),
+        _ => None,
+    });
+    assert!(lost.unwrap().contains("this engine is broken"), "{lost:?}");
+    assert!(events.contains(&(None, EventKind::DeviceBack)));
+    assert!(answers(&collector.observations(), 1)[0] > 3);
+}
+
+/// A sink that takes a second for its first observation.
+struct Slow(Collector);
+
+impl Sink for Slow {
+    fn observation(&mut self, observation: &Observation) {
+        if self.0.observations().is_empty() {
+            std::thread::sleep(1000 * MS);
+        }
+        self.0.observation(observation);
+    }
+
+    fn event(&mut self, event: &Event) {
+        self.0.event(event);
+    }
+
+    fn statistics(&mut self, statistics: &Statistics) {
+        Sink::statistics(&mut self.0, statistics);
+    }
+}
+
+#[test]
+fn a_sink_that_waits_gets_the_newest_answers_and_all_events() {
+    const FRAMES: usize = 30;
+    let run = |slow: bool| {
+        let collector = Collector::default();
+        let sink: Box<dyn Sink> = if slow {
+            Box::new(Slow(collector.clone()))
+        } else {
+            Box::new(collector.clone())
+        };
+        let mut engine = StandIn::new(MS, 1);
+        engine.lost = Some((FRAMES / 3, 8192));
+        let cameras = vec![Simulated::new(50 * MS, FRAMES as u64).input()];
+        let stop = Arc::new(Stop::default());
+        watch(cameras, Box::new(engine), vec![sink], &stop);
+        collector
+    };
+    let collector = run(true);
+    let observations = collector.observations();
+    // Of those that came meanwhile, one.
+    assert!(observations.len() < FRAMES / 2, "{}", observations.len());
+    let last = FRAMES as u64 - 1;
+    assert_eq!(observations.last().unwrap().frame, last);
+    assert_eq!(losses(&collector), 1);
+    let statistics = collector.statistics();
+    let dropped = statistics.last().unwrap().cameras[0].dropped as usize;
+    assert!(dropped + observations.len() <= FRAMES && dropped > FRAMES / 3);
+    // Negative control: one that does not wait gets nearly all.
+    assert!(run(false).observations().len() > FRAMES * 2 / 3);
+}
+
+#[test]
+fn another_device_s_limits_are_asked_for() {
+    let run = |max_side| {
+        let mut engine = StandIn::new(5 * MS, 1);
+        engine.lost = Some((3, max_side));
+        run(vec![Simulated::new(50 * MS, 10).input()], engine)
+    };
+    let collector = run(63);
+    assert_eq!(losses(&collector), 1);
+    assert_eq!(answers(&collector.observations(), 1), [3]);
+    let told = failures(&collector);
+    assert!(told[0].1.contains("1 to 63 pixels"), "{told:?}");
+    // Negative control: it takes the frames, too.
+    let collector = run(64);
+    assert_eq!(losses(&collector), 1);
+    assert!(answers(&collector.observations(), 1)[0] > 3);
+    assert_eq!(failures(&collector), []);
 }
 
 #[test]

@@ -5,8 +5,9 @@ use std::sync::{Arc, Mutex, mpsc};
 use std::time::{Duration, Instant, SystemTime};
 
 use image::{Rgba, RgbaImage};
-use whereabot::camera::Orientation;
+use whereabot::camera::{Camera, Orientation};
 use whereabot::cascade::{Estimate, LocateError, Status};
+use whereabot::gpu::GpuError;
 use whereabot::live::{
     Calibration, Engine, Event, EventKind, Frame, IN_FLIGHT, Input, KnownModel, Observation, Shot,
     Sink, Source, SourceError, Statistics, Stop, Stream,
@@ -40,6 +41,10 @@ pub struct Simulated {
     pub pause: Option<(u64, Duration)>,
     /// From which frame on its clock is how much behind.
     pub clock_back: Option<(u64, Duration)>,
+    /// At which frame it panics, each time that it is opened.
+    pub panics_at: Option<u64>,
+    /// What it says its camera is; its images have 64 x 48 pixels.
+    pub camera: Option<Camera>,
 }
 
 impl Simulated {
@@ -49,6 +54,8 @@ impl Simulated {
             count,
             pause: None,
             clock_back: None,
+            panics_at: None,
+            camera: None,
         }
     }
 
@@ -71,6 +78,8 @@ impl Source for Simulated {
             next: Instant::now(),
             pause: self.pause,
             clock_back: self.clock_back,
+            panics_at: self.panics_at,
+            camera: self.camera,
             stop: Arc::clone(stop),
         }))
     }
@@ -83,6 +92,8 @@ struct Frames {
     next: Instant,
     pause: Option<(u64, Duration)>,
     clock_back: Option<(u64, Duration)>,
+    panics_at: Option<u64>,
+    camera: Option<Camera>,
     stop: Arc<Stop>,
 }
 
@@ -98,6 +109,7 @@ impl Stream for Frames {
             self.next += pause;
         }
         let now = Instant::now();
+        assert_ne!(self.panics_at, Some(self.number), "this source is broken");
         if self.stop.wait(self.next.saturating_duration_since(now)) {
             return Ok(None);
         }
@@ -107,7 +119,10 @@ impl Stream for Frames {
         }
         let red = 128 + (self.number * 37 % 128) as u8;
         image.pixels_mut().for_each(|p| *p = Rgba([red, 0, 0, 255]));
-        let mut shot = Shot::now();
+        let mut shot = Shot {
+            camera: self.camera,
+            ..Shot::now()
+        };
         if let Some((frame, back)) = self.clock_back
             && self.number >= frame
         {
@@ -123,6 +138,12 @@ pub struct StandIn {
     pub service: Duration,
     pub batch: usize,
     pub max_side: u32,
+    /// The camera whose frames it cannot take.
+    pub refuses: Option<usize>,
+    /// Its device is lost after so many submissions; the next one takes a longest side of so many pixels.
+    pub lost: Option<(usize, u32)>,
+    /// It panics after so many submissions, and once more when it is opened again.
+    pub panics: Option<usize>,
     under_way: VecDeque<(Instant, usize)>,
 }
 
@@ -132,6 +153,9 @@ impl StandIn {
             service,
             batch,
             max_side: 8192,
+            refuses: None,
+            lost: None,
+            panics: None,
             under_way: VecDeque::new(),
         }
     }
@@ -148,6 +172,17 @@ impl Engine for StandIn {
 
     fn submit(&mut self, _robot: usize, frames: &[Frame]) -> Result<(), LocateError> {
         assert!(self.under_way.len() < IN_FLIGHT && frames.len() <= self.batch);
+        if frames.iter().any(|f| self.refuses == Some(f.camera)) {
+            return Err(GpuError::OutOfMemory("no place for that".into()).into());
+        }
+        if let Some(left) = &mut self.panics {
+            *left = left.checked_sub(1).expect("this engine is broken");
+        }
+        match &mut self.lost {
+            Some((0, _)) => return Err(GpuError::Lost("unplugged".into()).into()),
+            Some((left, _)) => *left -= 1,
+            None => {}
+        }
         let now = Instant::now();
         let begin = self.under_way.back().map_or(now, |&(end, _)| end.max(now));
         self.under_way
@@ -167,6 +202,10 @@ impl Engine for StandIn {
 
     fn reopen(&mut self) -> Result<(), LocateError> {
         self.under_way.clear();
+        assert!(self.panics.take().is_none(), "this engine is broken, too");
+        if let Some((_, max_side)) = self.lost.take() {
+            self.max_side = max_side;
+        }
         Ok(())
     }
 }

@@ -428,6 +428,19 @@ fn the_page_works_on_a_phone_without_webgpu() {
         .run("document.querySelector('[value=ur5]').click()");
     let mirrored = "return document.getElementById('view').className === 'mirrored'";
     assert_eq!(bench.page.run(mirrored), false);
+    // A camera whose pictures cannot be shown is let go of.
+    bench.page.run(
+        "const { play } = HTMLMediaElement.prototype;
+         HTMLMediaElement.prototype.play = async function () {
+             HTMLMediaElement.prototype.play = play;
+             [window.track] = this.srcObject.getTracks();
+             throw new Error('not now');
+         };
+         document.getElementById('camera').click()",
+    );
+    bench
+        .page
+        .wait_until("window.track?.readyState === 'ended'");
     bench.page.run(
         "MediaStreamTrack.prototype.getSettings = () => ({ facingMode: 'user' });
          document.getElementById('camera').click()",

@@ -117,7 +117,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             .map(line)
             .collect::<anyhow::Result<String>>()?
     };
-    io::stdout().lock().write_all(text.as_bytes())?;
+    super::print(&text)?;
     Ok(if failed {
         ExitCode::FAILURE
     } else {

@@ -4,7 +4,6 @@ mod pictures;
 mod report;
 mod rig;
 
-use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -238,7 +237,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     } else {
         report.to_string()
     };
-    io::stdout().lock().write_all(text.as_bytes())?;
+    super::print(&text)?;
     if let Some(folder) = &args.plots {
         pictures::draw(&mut results, &report, folder)?;
     }

@@ -1,4 +1,4 @@
-use std::fs::OpenOptions;
+use std::fs::{self, OpenOptions};
 use std::io::{ErrorKind, Write};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -19,6 +19,7 @@ use crate::live::{Event, Observation, Sink, Statistics};
 /// What the thread does not keep up with is not recorded, by whole observations, and counted: nobody waits for a disk.
 /// A second of the file is complete when it is over, so that a program that is killed loses no more than that.
 /// When the file cannot be written, that is logged, the rest is ignored, and [`Recorder::finish`] says why.
+#[derive(Debug)]
 pub struct Recorder {
     file: PathBuf,
     /// `None` once it is finished.
@@ -30,7 +31,7 @@ pub struct Recorder {
 }
 
 /// What both threads see.
-#[derive(Default)]
+#[derive(Debug, Default)]
 struct Shared {
     /// Bytes that wait for the thread.
     waiting: AtomicUsize,
@@ -66,12 +67,26 @@ impl Recorder {
         check_names(cameras)?;
         let file = file.into();
         match OpenOptions::new().write(true).create_new(true).open(&file) {
-            Ok(writer) => Self::new(writer, file, cameras),
+            Ok(writer) => Self::in_new_file(writer, file, cameras),
             Err(cause) if cause.kind() == ErrorKind::AlreadyExists => {
                 Err(McapError::Taken { file })
             }
             Err(cause) => Err(McapError::Create { file, cause }),
         }
+    }
+
+    /// Takes `file`, which was not there before, away again where nothing can be recorded: the next try finds none.
+    fn in_new_file(
+        writer: impl Write + Send + 'static,
+        file: PathBuf,
+        cameras: &[RecordedCamera],
+    ) -> Result<Self, McapError> {
+        let recorder = Self::new(writer, &file, cameras);
+        if recorder.is_err() {
+            // Where it stays, that is told when it is in the way.
+            let _ = fs::remove_file(&file);
+        }
+        recorder
     }
 
     /// Records `cameras` to whatever can be written; `file` is what messages call it.
@@ -334,5 +349,42 @@ impl<W: Write> Thread<W> {
     fn unwritten(&self, cause: mcap::McapError) -> McapError {
         let file = self.file.clone();
         McapError::Write { file, cause }
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use std::io;
+
+    use super::*;
+
+    /// A disk that is full from the beginning, or is not.
+    struct Disk {
+        full: bool,
+    }
+
+    impl Write for Disk {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            if self.full {
+                return Err(ErrorKind::StorageFull.into());
+            }
+            Ok(bytes.len())
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_recording_that_cannot_begin_leaves_no_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("out.mcap");
+        for full in [true, false] {
+            fs::write(&file, b"").unwrap();
+            let recorder = Recorder::in_new_file(Disk { full }, file.clone(), &[]);
+            assert_eq!((recorder.is_err(), file.exists()), (full, !full));
+        }
     }
 }

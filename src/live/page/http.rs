@@ -8,10 +8,14 @@ use std::time::{Duration, Instant};
 /// The most that a request's line and headers may take, in bytes.
 const LONGEST_HEAD: usize = 16 * 1024;
 const MOST_HEADERS: usize = 64;
-/// Within which a request must have come, counted from the last answer.
+/// Within which a connection's first request must have come: whoever connects and says nothing keeps others out.
+const FIRST_REQUEST_LIMIT: Duration = Duration::from_secs(1);
+/// Within which a further one must have come, counted from the last answer.
 const REQUEST_LIMIT: Duration = Duration::from_secs(5);
 /// Within which a client must have taken an answer.
 const ANSWER_LIMIT: Duration = Duration::from_secs(5);
+
+const OK: &str = "200 OK";
 
 /// What a client asks for.
 #[derive(Debug, PartialEq, Eq)]
@@ -40,7 +44,7 @@ pub(super) struct Answer {
 impl Answer {
     pub fn new(kind: &'static str, parts: Vec<Arc<[u8]>>) -> Self {
         Self {
-            status: "200 OK",
+            status: OK,
             kind,
             parts,
         }
@@ -97,16 +101,20 @@ pub(super) fn serve(stream: TcpStream, answer: impl Fn(&Request) -> Option<Answe
         stream,
         buffer: Vec::new(),
     };
+    let mut limit = FIRST_REQUEST_LIMIT;
     loop {
-        match connection.request() {
+        match connection.request(limit) {
             Ok(request) => {
                 let Some(answer) = answer(&request) else {
                     return;
                 };
-                let sent = connection.send(&answer, request.again, request.head);
-                if sent.is_err() || !request.again {
+                // Who is refused, such as for want of the token, keeps no seat either.
+                let again = request.again && answer.status == OK;
+                let sent = connection.send(&answer, again, request.head);
+                if sent.is_err() || !again {
                     return;
                 }
+                limit = REQUEST_LIMIT;
             }
             Err(End::Gone) => return,
             Err(End::Refused(answer)) => {
@@ -134,8 +142,8 @@ pub(super) fn turn_away(stream: TcpStream) {
 }
 
 impl Connection {
-    fn request(&mut self) -> Result<Request, End> {
-        let until = Instant::now() + REQUEST_LIMIT;
+    fn request(&mut self, limit: Duration) -> Result<Request, End> {
+        let until = Instant::now() + limit;
         loop {
             if let Some((request, length)) = parse(&self.buffer).map_err(End::Refused)? {
                 self.buffer.drain(..length);

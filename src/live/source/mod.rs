@@ -45,7 +45,7 @@ pub struct Shot {
     pub acquired: SystemTime,
     /// The same by the monotonic clock.
     pub acquired_at: Instant,
-    /// Its camera, where the source knows.
+    /// Its camera, where the source knows: of the image's size.
     pub camera: Option<Camera>,
 }
 
@@ -84,6 +84,9 @@ pub enum SourceError {
     /// `ffmpeg` ended, or gave something else than frames.
     #[error("{0}")]
     Ffmpeg(String),
+    /// It panicked: a defect of the source.
+    #[error("the source panicked: {0}")]
+    Panicked(String),
     /// No frame came for so long.
     #[error("no frame for {0:?}")]
     Stalled(Duration),

@@ -1,4 +1,4 @@
-use std::collections::VecDeque;
+use std::collections::{HashSet, VecDeque};
 use std::io::Write;
 use std::process::{Command, Stdio};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -62,12 +62,16 @@ struct Notice {
     /// The warning as JSON, with its time and camera.
     body: String,
     since: Instant,
+    /// Of no use once the notice before it is done: it is there only because that was not.
+    again: bool,
 }
 
 /// What a worker has to do: at most one notice a rule.
 #[derive(Debug, Default)]
 struct Pending {
     notices: VecDeque<Notice>,
+    /// The rules whose last notice is not done: it waits, is being acted on, or was given up.
+    undone: HashSet<String>,
     busy: bool,
     closing: bool,
 }
@@ -88,7 +92,8 @@ struct Worker {
 }
 
 /// Does actions, each in a thread of its own. A newer state of a rule takes the place of an older one that was not acted on
-/// yet, or that failed and waits to be tried again.
+/// yet, or that failed and waits to be tried again. What failed for good is not forgotten: the rule's next state is acted on
+/// even if it counts as the one before.
 pub struct Actions {
     workers: Vec<Worker>,
 }
@@ -135,17 +140,25 @@ impl Actions {
         let mut body = None;
         for worker in &self.workers {
             let serves = |rules: &Vec<String>| rules.contains(&warning.rule);
-            if !(worker.warnings.as_ref().is_none_or(serves) && triggers(&worker.on, warning)) {
+            let [before, now] = entered(&worker.on, warning);
+            if now.is_none() || !worker.warnings.as_ref().is_none_or(serves) {
                 continue;
             }
+            let mut pending = worker.mailbox.lock();
+            if before == now && !pending.undone.contains(&warning.rule) {
+                continue;
+            }
+            let same = |other: &Notice| other.warning.rule == warning.rule;
+            let mut waiting = pending.notices.iter().filter(|other| same(other));
+            let again = before == now && waiting.all(|other| other.again);
             let body = body.get_or_insert_with(|| body_of(warning, camera, at));
             let notice = Notice {
                 warning: warning.clone(),
                 body: body.clone(),
                 since: Instant::now(),
+                again,
             };
-            let mut pending = worker.mailbox.lock();
-            let same = |other: &Notice| other.warning.rule == warning.rule;
+            pending.undone.insert(warning.rule.clone());
             pending.notices.retain(|other| !same(other));
             pending.notices.push_back(notice);
             worker.mailbox.changed.notify_all();
@@ -200,6 +213,16 @@ impl Mailbox {
         }
     }
 
+    /// A notice of `rule` is done.
+    fn done(&self, rule: &str) {
+        let mut pending = self.lock();
+        let of_rule = |notice: &Notice| notice.warning.rule == rule;
+        pending.notices.retain(|n| !(of_rule(n) && n.again));
+        if !pending.notices.iter().any(of_rule) {
+            pending.undone.remove(rule);
+        }
+    }
+
     /// Waits before `notice` is tried again. False if it is not to be: a newer one of its rule is there, or the end.
     fn wait(&self, notice: &Notice, pause: Duration) -> bool {
         let current = |pending: &mut Pending| {
@@ -232,6 +255,9 @@ impl Doer {
             let mut pause = Self::PAUSE;
             for attempt in 1..=self.attempts {
                 let done = self.attempt(&notice, attempt);
+                if done {
+                    self.mailbox.done(&notice.warning.rule);
+                }
                 if done || attempt == self.attempts || !self.mailbox.wait(&notice, pause) {
                     break;
                 }
@@ -274,17 +300,18 @@ impl Doer {
     }
 }
 
-/// Whether an action on these states is done for a warning: it enters one of them, itself or as what it counts as, that it
-/// was not in before.
-fn triggers(on: &[State], warning: &Warning) -> bool {
+/// Which of the states that an action is done on a rule was in before, and is in now, itself or as what it counts as.
+fn entered(on: &[State], warning: &Warning) -> [Option<State>; 2] {
     let entered = |state: State, acts_as: State| {
         let mut ways = [state, acts_as].into_iter();
         ways.find(|state| on.contains(state))
     };
     let now = entered(warning.state, warning.acts_as);
     let before = warning.before.zip(warning.acted_as);
-    let before = before.and_then(|(state, acted_as)| entered(state, acted_as));
-    now.is_some() && now != before
+    [
+        before.and_then(|(state, acted_as)| entered(state, acted_as)),
+        now,
+    ]
 }
 
 fn effect(action: &config::Action) -> Effect {

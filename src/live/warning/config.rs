@@ -26,32 +26,32 @@ pub struct Config {
 #[serde(deny_unknown_fields)]
 pub struct Rule {
     /// Its name, which no other has.
-    pub name: Spanned<String>,
+    pub(super) name: Spanned<String>,
     /// The names of the cameras that it looks through.
-    pub cameras: Spanned<Vec<Spanned<String>>>,
+    pub(super) cameras: Spanned<Vec<Spanned<String>>>,
     /// Which of them must see the robot.
     #[serde(default)]
-    pub expect: Expect,
+    pub(super) expect: Expect,
     /// What the robot must not come close to.
-    pub protect: Spanned<Protect>,
+    pub(super) protect: Spanned<Protect>,
     /// It is a warning within this distance, in metres.
-    pub warn_m: Spanned<f64>,
+    pub(super) warn_m: Spanned<f64>,
     /// It is a stop within this distance, in metres.
-    pub stop_m: Spanned<f64>,
+    pub(super) stop_m: Spanned<f64>,
     /// How much farther than a distance it must be to be less dangerous again, in metres.
     #[serde(default = "hysteresis_m")]
-    pub hysteresis_m: Spanned<f64>,
+    pub(super) hysteresis_m: Spanned<f64>,
     /// So many frames must agree before anything changes.
     #[serde(default = "agree")]
-    pub agree: Spanned<u32>,
+    pub(super) agree: Spanned<u32>,
     /// A frame says nothing about now once it is older than this, in seconds.
     #[serde(default = "max_age_s")]
-    pub max_age_s: Spanned<f64>,
+    pub(super) max_age_s: Spanned<f64>,
     /// What is taken off measured distances, in metres, where it is more than what the weights' card says.
-    pub uncertainty_m: Option<Spanned<f64>>,
+    pub(super) uncertainty_m: Option<Spanned<f64>>,
     /// What unknown counts as.
     #[serde(default)]
-    pub unknown: Policy,
+    pub(super) unknown: Policy,
 }
 
 /// Which of a rule's cameras must see the robot.
@@ -116,23 +116,23 @@ pub struct Places {
 #[serde(deny_unknown_fields)]
 pub struct Action {
     /// Its name, which no other has.
-    pub name: Spanned<String>,
+    pub(super) name: Spanned<String>,
     /// The states that it is done for.
-    pub on: Spanned<Vec<State>>,
+    pub(super) on: Spanned<Vec<State>>,
     /// The rules that it is done for; all where none are named.
-    pub warnings: Option<Vec<Spanned<String>>>,
+    pub(super) warnings: Option<Vec<Spanned<String>>>,
     /// A program and its arguments. It gets the warning as JSON on its standard input.
-    pub command: Option<Spanned<Vec<String>>>,
+    pub(super) command: Option<Spanned<Vec<String>>>,
     /// Where the warning is posted to as JSON.
-    pub post: Option<Spanned<String>>,
+    pub(super) post: Option<Spanned<String>>,
     /// A robot that is told to pause or stop.
-    pub dashboard: Option<Spanned<Dashboard>>,
+    pub(super) dashboard: Option<Spanned<Dashboard>>,
     /// How long one attempt may take, in seconds.
     #[serde(default = "timeout_s")]
-    pub timeout_s: Spanned<f64>,
+    pub(super) timeout_s: Spanned<f64>,
     /// How often it is tried.
     #[serde(default = "attempts")]
-    pub attempts: Spanned<u32>,
+    pub(super) attempts: Spanned<u32>,
 }
 
 /// A Universal Robots controller's dashboard server.

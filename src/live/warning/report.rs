@@ -17,6 +17,7 @@ pub enum State {
 /// Why a rule is [`State::Unknown`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
+#[non_exhaustive]
 pub enum Why {
     /// Too few answers since the start.
     Starting,

@@ -1,3 +1,4 @@
+use std::fmt;
 use std::sync::mpsc::{self, RecvTimeoutError, Sender};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
@@ -27,6 +28,14 @@ pub struct Warnings {
     watch: Arc<Watch>,
     /// Ends the thread when it is dropped.
     _end: Sender<()>,
+}
+
+impl fmt::Debug for Warnings {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Warnings")
+            .field("cameras", &self.watch.cameras)
+            .finish_non_exhaustive()
+    }
 }
 
 /// Shared by the sink and its thread.
@@ -60,7 +69,6 @@ impl Warnings {
             actions: Actions::start(config, &emit)?,
             emit,
         });
-        watch.judge(Monitor::tick);
         let (end, ended) = mpsc::channel::<()>();
         let ticking = Arc::clone(&watch);
         thread::Builder::new()
@@ -70,6 +78,8 @@ impl Warnings {
                     ticking.judge(Monitor::tick);
                 }
             })?;
+        // Last: what it acts on cannot be taken back.
+        watch.judge(Monitor::tick);
         Ok(Self { watch, _end: end })
     }
 }

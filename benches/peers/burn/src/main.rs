@@ -178,7 +178,6 @@ impl Layer {
                     .with_align_corners(false)
                     .with_scale_factor([scale; 2]),
             ),
-            Operation::Concat => unreachable!("done above"),
             Operation::SoftArgmax2d { origin, step } => {
                 let cells = height * width;
                 let device = input.device();
@@ -203,6 +202,7 @@ impl Layer {
                 Tensor::cat(vec![places.narrow(1, 0, 2) * z.clone(), z], 1)
                     .reshape([1, channels, 1, 1])
             }
+            other => return Err(format!("{other:?} is not written for burn").into()),
         })
     }
 }
