@@ -10,7 +10,7 @@ const DAMPING = 0.01;
 const FREEDOMS = 8u;
 const COLUMNS = FREEDOMS + 1u;
 const NEAREST = 0.01;
-const LOWEST_COST = 3.4e38;
+const GREATEST = 3.4e38;
 
 struct Links {
     shoulder_offset: f32,
@@ -234,7 +234,7 @@ fn main(
     for (var joint = 0u; joint < JOINTS; joint++) {
         best[joint] = seen[joint];
     }
-    var least = LOWEST_COST;
+    var least = GREATEST;
     for (var body = 0u; body < BODIES; body++) {
         let links = links_of(body);
         if lane == 0u {

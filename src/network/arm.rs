@@ -68,8 +68,8 @@ impl Arm {
             }
         }
         for (name, matrix) in [("across", &self.across), ("along", &self.along)] {
-            let found = matrix.iter().flatten().find(|value| !(value.abs() <= 1e6));
-            if let Some(value) = found {
+            let mut values = matrix.iter().flatten();
+            if let Some(value) = values.find(|v| v.is_nan() || v.abs() > 1e6) {
                 return Err(format!(
                     "arm.{name}: expected numbers up to a million, found {value}"
                 ));

@@ -217,10 +217,11 @@ fn solve(
         })
     });
     for i in 0..FREEDOMS {
-        for j in i + 1..FREEDOMS {
-            let factor = rows[j][i] / rows[i][i];
-            for k in i..=FREEDOMS {
-                rows[j][k] -= factor * rows[i][k];
+        let pivot = rows[i];
+        for row in rows.iter_mut().skip(i + 1) {
+            let factor = row[i] / pivot[i];
+            for (value, above) in row.iter_mut().zip(pivot).skip(i) {
+                *value -= factor * above;
             }
         }
     }
