@@ -45,6 +45,39 @@ def test_another_picture_under_the_same_name_is_read(recording, tmp_path):
     assert (after[0] * 255).round().eq(9).all() and not torch.equal(after[0], before[0])
 
 
+def test_who_reads_the_cache_keeps_what_was_in_it(recording, tmp_path):
+    folder = tmp_path / "redrawn"
+    shutil.copytree(recording, folder)
+    trained_on = data.Samples([folder], tmp_path / "cache")
+    before = trained_on.pixels([4])[0]
+    Image.new("RGB", (512, 424), (9, 9, 9)).save(folder / "image" / "000000.jpg")
+    again = data.Samples([folder], tmp_path / "cache")
+    assert torch.equal(trained_on.pixels([4])[0], before) and torch.equal(again.pixels([4])[0], before)
+    assert not torch.equal(trained_on.pixels([0])[0], again.pixels([0])[0])
+
+
+def test_a_mask_s_parts_are_those_of_its_picture():
+    torch.manual_seed(5)
+    # Where the mask is, the picture is bright, whatever becomes of its colours.
+    masks = torch.zeros(40, 1, 60, 80)
+    for mask, x in zip(masks, range(5, 45), strict=True):
+        mask[:, 20:40, x : x + 20] = 1
+    images = (masks.permute(0, 2, 3, 1) * 150 + 50).byte().expand(-1, -1, -1, 3).contiguous()
+    parts, truth = data.mixed_views(images, masks, 48, 64, (0.8, 1.25))
+    assert parts.shape == (40, 3, 48, 64) and truth.shape == (40, 1, 48, 64)
+
+    def agreeing(truth):
+        shown = parts.mean(1, keepdim=True)
+        middle = shown.amin((1, 2, 3), keepdim=True) / 2 + shown.amax((1, 2, 3), keepdim=True) / 2
+        return ((shown > middle) == (truth > 0.5)).float().mean()
+
+    assert agreeing(truth) > 0.95 > agreeing(truth.flip(3))
+    plain = (parts * 255).round()
+    as_they_are = ((plain == 50) | (plain == 200)).all((1, 2, 3)).float().mean()
+    # Two in three keep their colours, and of these two in three their view.
+    assert 0.2 < as_they_are < 0.7
+
+
 def test_one_sample_in_five_is_for_testing():
     assert np.flatnonzero(data.is_test(np.arange(40))).tolist() == [0, 1, 5, 7, 9, 16, 23, 26, 31, 35]
     assert 0.19 < data.is_test(np.arange(10000)).mean() < 0.21

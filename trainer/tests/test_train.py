@@ -80,10 +80,10 @@ def test_export_folds_calibration_and_unit(train, recording, tmp_path, family):
     assert [len(description["card"]["curves"][name]) for name in ("mask_accuracy", "estimated_mask_cm")] == [1, 1]
     assert description["card"]["figures"]["estimated_mask_mean_cm"] > 0
 
-    trained_mask, mask_state = load_network(mask_run)
+    trained_mask, _ = load_network(mask_run)
     trained_joint, joint_state = load_network(joint_run)
     images, _ = data.Samples([recording], tmp_path / "cache").pixels([0, 1])
-    shift = mask_state["figures"]["logit_shift"]
+    shift = description["card"]["calibration"]["logit_shift"]
     assert torch.allclose(mask(images), torch.sigmoid(torch.logit(trained_mask(images)) + shift), atol=1e-5)
     assert not torch.allclose(mask(images), trained_mask(images), atol=1e-2)
     arms = torch.full((2,), float(data.Samples([recording], tmp_path / "cache").arms[0]))
@@ -129,7 +129,7 @@ def test_committed_golden_files_are_what_pytorch_computes(tmp_path, request):
     committed = request.config.rootpath.parent / "tests" / "data" / "golden"
     golden.write_golden(tmp_path)
     names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == sorted(path.name for path in committed.iterdir()) and len(names) == 12
+    assert names == sorted(path.name for path in committed.iterdir()) and len(names) == 14
     for name in names:
         made, kept = load_file(tmp_path / name), load_file(committed / name)
         assert made.keys() == kept.keys()

@@ -129,6 +129,10 @@ def _locked_pixels(folder, samples, cache, stem):
     shapes = {"images": (INPUT_HEIGHT, INPUT_WIDTH, 3), "masks": (INPUT_HEIGHT, INPUT_WIDTH)}
     paths = {key: cache / f"{stem}.{key}.u8" for key in shapes}
     if done < len(samples):
+        if not done:
+            # Somebody may train on what was there: it stays theirs.
+            for path in paths.values():
+                path.unlink(missing_ok=True)
         with open(paths["images"], "ab") as images, open(paths["masks"], "ab") as masks, ThreadPoolExecutor() as pool:
             images.truncate(done * math.prod(shapes["images"]))
             masks.truncate(done * math.prod(shapes["masks"]))
@@ -258,6 +262,10 @@ def _uniform(count, low, high, *shape):
     return torch.empty(count, *shape).uniform_(low, high)
 
 
+# Share of the samples whose colours, and whose view or mask, vary beyond what the recordings vary already.
+VARIED = 0.35
+
+
 def jitter_masks(masks):
     """Another estimate of the same: probabilities moved, as a whole and each by itself, where they are not sure.
 
@@ -276,6 +284,15 @@ def jitter_colours(images):
     # On a CPU, one image at a time stays in the cache through all of these passes.
     parts = images.split(1 if images.device.type == "cpu" else len(images))
     return torch.cat([_jitter_colours(part) for part in parts]).permute(0, 3, 1, 2)
+
+
+def jitter_some_colours(images):
+    """The same of a share VARIED of the images; the others as they are."""
+    plain = images.permute(0, 3, 1, 2).float() / 255
+    some = torch.rand(len(images)) < VARIED
+    if some.any():
+        plain[some] = jitter_colours(images[some])
+    return plain
 
 
 def _jitter_colours(images):
@@ -324,6 +341,20 @@ def random_views(images, masks, height, width, tilt_degrees=10, zoom=(0.7, 1.6))
     padding = "zeros" if torch.rand(()) < 0.1 else "reflection"
     both = torch.nn.functional.grid_sample(both, grid, padding_mode=padding, align_corners=False)
     return both[:, :3], (both[:, 3:] >= 0.5).float()
+
+
+def mixed_views(images, masks, height, width, zoom):
+    """What a free camera's mask network learns from: parts of height x width of the pictures, uint8 [N, H, W, 3], as they are, mirrored
+    half of the time; of some the colours vary, of some the view. Of all, that would be another task than the one it is judged
+    by: the pictures have lights, cameras and sizes of their own."""
+    plain = jitter_some_colours(images)
+    moved = torch.rand(len(images)) < VARIED
+    parts, truth = random_crops(plain, masks, height, width)
+    mirrored = torch.rand(len(images)) < 0.5
+    parts[mirrored], truth[mirrored] = parts[mirrored].flip(3), truth[mirrored].flip(3)
+    if moved.any():
+        parts[moved], truth[moved] = random_views(plain[moved], masks[moved], height, width, zoom=zoom)
+    return parts, truth
 
 
 def random_crops(images, masks, height, width):

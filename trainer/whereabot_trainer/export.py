@@ -55,8 +55,8 @@ def _mean_of(runs):
 
 def export_runs(args):
     """Folds calibration and standardisation into the weights, measures the cascade, and writes the model file."""
-    several = len(args.mask) > 1
-    mask, _, mask_mean = _mean_of(args.mask) if several else (load_mask(args.mask[0]), None, {})
+    trained = Path(args.mask[-1]).is_dir()
+    mask, _, mask_mean = _mean_of(args.mask) if trained else (load_mask(args.mask[0]), None, {})
     mask_card = _mask_card(args.mask[-1])
     joint, joint_state, joint_mean = _mean_of(args.joint)
     rules = joint_state["card"]["overlay"], joint_state["card"].get("zoom")
@@ -69,8 +69,8 @@ def export_runs(args):
     own = samples.robots == robot
     arm = float(samples.arms[own][0])
     output_unit(joint_state["card"]).fold(joint, arm)
-    # What presence is chosen on is not reported on. It is chosen on all robots: the mask network may be, and a recording
-    # has few images without one.
+    # What the mask's threshold and presence are chosen on is not reported on. How many images without a robot pass is
+    # seen on all robots' recordings: one has few such images.
     if args.validation:
         order = np.random.default_rng(args.seed).permutation(len(samples))
         chosen, reported = order[: args.validation_samples], np.sort(order[args.validation_samples :])
@@ -84,8 +84,8 @@ def export_runs(args):
         chosen = np.random.default_rng(args.seed).permutation(training)[: args.validation_samples]
     order = np.union1d(chosen, reported)
 
-    if several:
-        shift = evaluate.calibrate(mask, samples, chosen, args.device)
+    if trained:
+        shift = evaluate.calibrate(mask, samples, chosen[own[chosen]], args.device)
         evaluate.shift_logits(mask, shift)
         mask_card["calibration"]["logit_shift"] = shift
     estimated = evaluate.estimate_masks(mask, samples, order, args.device)
@@ -95,10 +95,10 @@ def export_runs(args):
     def shares(numbers, threshold):
         return [float((estimated[n] >= 255 * threshold).mean()) for n in numbers]
 
-    if Path(args.mask[-1]).is_dir():
+    if trained:
         sure, least = choose_presence(*(
             {threshold: shares(chosen[kind[chosen]], threshold) for threshold in SURE_THRESHOLDS}
-            for kind in (seen, empty)))
+            for kind in (seen & own, empty)))
     else:
         # It is the mask network's, which stays.
         presence = read_model(args.mask[-1])[2]["presence"]
@@ -125,7 +125,7 @@ def export_runs(args):
     figures["presence"] = {}
     for part, numbers in (("chosen", chosen), ("reported", reported)):
         figures["presence"] |= {
-            f"{part}_robots_found": _rate(value >= least for value in shares(numbers[seen[numbers]], sure)),
+            f"{part}_robots_found": _rate(value >= least for value in shares(numbers[(seen & own)[numbers]], sure)),
             f"{part}_without_robot_rejected": _rate(value < least for value in shares(numbers[empty[numbers]], sure))}
     figures["samples"] = {"chosen_on": len(chosen), "reported_on": len(reported), "with_robot": len(shown)}
 

@@ -317,10 +317,10 @@ def train_mask(args):
             rows = torch.rand(len(batch), device="cpu") < args.negative_share
             drawn = torch.randint(len(negatives), (int(rows.sum()),), device="cpu")
             images[rows], masks[rows] = torch.from_numpy(negatives[drawn.numpy()]).to(images.device), 0.0
-        images, masks = data.jitter_colours(images.to(args.device)), masks.to(args.device)
+        images, masks = images.to(args.device), masks.to(args.device)
         if args.camera == "fixed":
-            return data.random_crops(images, masks, height, width)
-        return data.random_views(images, masks, height, width, zoom=args.zoom)
+            return data.random_crops(data.jitter_colours(images), masks, height, width)
+        return data.mixed_views(images, masks, height, width, args.zoom)
 
     def batch_loss(images, masks):
         return losses.mask_loss(network(images), masks, w_fg, w_bg)
@@ -472,10 +472,15 @@ def train_joint(args):
 
     def draw(batch, progress):
         images, masks = samples.bytes(batch)
-        images, masks = data.jitter_colours(images.to(args.device)), masks.to(args.device)
+        images, masks = images.to(args.device), masks.to(args.device)
+        images = (data.jitter_colours if args.camera == "fixed" else data.jitter_some_colours)(images)
         rows = torch.rand(len(batch)) < (args.estimated_masks if progress >= args.estimated_after else 0)
         if rows.any():
-            masks[rows] = data.jitter_masks(evaluate.masks_of(mask_network, images[rows], args.precision == "bf16"))
+            estimates = evaluate.masks_of(mask_network, images[rows], args.precision == "bf16")
+            moved = torch.rand(len(estimates)) < (1 if args.camera == "fixed" else data.VARIED)
+            if moved.any():
+                estimates[moved] = data.jitter_masks(estimates[moved])
+            masks[rows] = estimates
         truth, zooms = joints[batch].to(args.device), torch.ones(len(batch))
         if view or args.camera == "free":
             if view:
