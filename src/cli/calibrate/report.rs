@@ -9,6 +9,9 @@ use super::angles::Match;
 use crate::calibration::Registration;
 use crate::live::ros;
 
+/// From fewer poses of the robot, what a pose's joints have in common is not told from where the camera is.
+const ENOUGH_POSES: usize = 5;
+
 /// A camera's pose in the robot's base frame, and how sure it is.
 #[derive(Serialize)]
 pub struct Report {
@@ -116,6 +119,13 @@ impl Report {
             self.frames_unmatched,
             100.0 * self.inlier_share
         );
+        if self.poses < ENOUGH_POSES {
+            let _ = writeln!(
+                text,
+                "  fewer than {ENOUGH_POSES} poses: joints of a pose agree with each other however far they are off together, \
+                 and the deviations know nothing of that"
+            );
+        }
         let _ = writeln!(
             text,
             "  {:14} {:>7} {:>6} {:>9} {:>10}",
