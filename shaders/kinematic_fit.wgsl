@@ -36,8 +36,13 @@ var<workgroup> seen: array<vec3<f32>, JOINTS>;
 var<workgroup> sight: vec3<f32>;
 var<workgroup> mean_depth: f32;
 var<workgroup> posture: Posture;
+// Each column as it is, and whitened.
+var<workgroup> plain: array<array<vec4<f32>, JOINTS>, COLUMNS>;
 var<workgroup> columns: array<array<vec4<f32>, JOINTS>, COLUMNS>;
+// The normal equations, and what solves them.
 var<workgroup> rows: array<array<f32, COLUMNS>, FREEDOMS>;
+var<workgroup> by: array<f32, FREEDOMS>;
+var<workgroup> best: array<vec3<f32>, JOINTS>;
 
 fn value(image: u32, channel: u32) -> f32 {
     return input_at(channel / 4u * BATCH + image, 0u, 0u)[channel % 4u];
@@ -142,18 +147,17 @@ fn change(links: Links, freedom: u32, joint: u32) -> vec4<f32> {
 }
 
 fn bring_forth(column: u32, links: Links) {
-    var values: array<vec4<f32>, JOINTS>;
     for (var joint = 0u; joint < JOINTS; joint++) {
         if column == FREEDOMS {
-            values[joint] = error(links, joint);
+            plain[column][joint] = error(links, joint);
         } else {
-            values[joint] = change(links, column, joint);
+            plain[column][joint] = change(links, column, joint);
         }
     }
     for (var i = 0u; i < JOINTS; i++) {
         var sum = vec4(0.0);
         for (var j = 0u; j < JOINTS; j++) {
-            sum += weight(i, j) * values[j];
+            sum += weight(i, j) * plain[column][j];
         }
         columns[column][i] = sum;
     }
@@ -167,8 +171,8 @@ fn product(a: u32, b: u32) -> f32 {
     return sum;
 }
 
-// The step by the normal equations in `rows`, by Gauss's elimination.
-fn solve() -> array<f32, FREEDOMS> {
+// By Gauss's elimination.
+fn solve() {
     for (var i = 0u; i < FREEDOMS; i++) {
         for (var j = i + 1u; j < FREEDOMS; j++) {
             let factor = rows[j][i] / rows[i][i];
@@ -177,20 +181,18 @@ fn solve() -> array<f32, FREEDOMS> {
             }
         }
     }
-    var solution: array<f32, FREEDOMS>;
     for (var back = 0u; back < FREEDOMS; back++) {
         let i = FREEDOMS - 1u - back;
         var value = rows[i][FREEDOMS];
         for (var j = i + 1u; j < FREEDOMS; j++) {
-            value -= rows[i][j] * solution[j];
+            value -= rows[i][j] * by[j];
         }
-        solution[i] = value / rows[i][i];
+        by[i] = value / rows[i][i];
     }
-    return solution;
 }
 
 fn move_posture() {
-    let by = solve();
+    solve();
     let turn = vec3(by[3], by[4], by[5]);
     let axis = turned(posture.axis, turn);
     posture.origin += vec3(by[0], by[1], by[2]);
@@ -230,9 +232,8 @@ fn main(
     if lane == 0u {
         mean_depth = depths / f32(JOINTS);
     }
-    var best: array<vec3<f32>, JOINTS>;
-    for (var joint = 0u; joint < JOINTS; joint++) {
-        best[joint] = seen[joint];
+    if lane < JOINTS {
+        best[lane] = seen[lane];
     }
     var least = GREATEST;
     for (var body = 0u; body < BODIES; body++) {

@@ -272,6 +272,18 @@ fn frames_are_matched_by_file_name_and_by_order() {
 }
 
 #[test]
+fn few_poses_are_told() {
+    let bench = Bench::new();
+    let all = watched(&bench, "left", camera_from_base(0.3));
+    let first: Vec<&str> = all.lines().take(4).collect();
+    bench.write("lines", &first.join("\n"));
+    let header = format!("time_s,{}", JOINTS.join(","));
+    bench.write("angles.csv", &table(&header, ","));
+    let (text, _, _) = bench.calibrate(&["lines", "--angles", "angles.csv"]);
+    assert!(text.contains("fewer than 5 poses"), "{text}");
+}
+
+#[test]
 fn a_pose_is_told_in_the_forms_of_ros() {
     let bench = Bench::new();
     bench.write("lines", &watched(&bench, "left cam", camera_from_base(0.3)));
@@ -287,6 +299,7 @@ fn a_pose_is_told_in_the_forms_of_ros() {
     let [x, y, z]: [f64; 3] = serde_json::from_value(report["translation_m"].clone()).unwrap();
     let arguments = format!("--x {x:.6} --y {y:.6} --z {z:.6} --qx");
     let text = run(&[]);
+    assert!(!text.contains("fewer than"), "{text}");
     assert!(
         text.contains(&format!(
             "ros2 run tf2_ros static_transform_publisher {arguments}"
