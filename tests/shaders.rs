@@ -312,7 +312,7 @@ fn compile(language: Language, entry: &EntryPoint, translated: &[u8]) -> Result<
 
 /// Kernels that naga clears arrays in, in HLSL by a cast of 0. Microsoft's compilers have that cast,
 /// glslang has not.
-const CLEARS_ARRAYS: [&str; 9] = [
+const CLEARS_ARRAYS: [&str; 10] = [
     "conv2d_buffer",
     "conv2d_one",
     "conv2d_subgroup",
@@ -320,6 +320,7 @@ const CLEARS_ARRAYS: [&str; 9] = [
     "conv2d_texture",
     "conv2d_tiled",
     "dense",
+    "kinematic_fit",
     "soft_argmax2d",
     "zoom",
 ];
