@@ -295,7 +295,8 @@ fn joints_are_where_the_arm_can_have_them() {
     };
     let on_gpu = |model: &Model| joints(Locator::on_gpu(device(), model, Precision::F32).unwrap());
     let (gpu, cpu) = (on_gpu(&model), joints(Locator::on_cpu(&model)));
-    assert!(difference(&gpu, &cpu).unwrap() <= 1e-4);
+    // The fit makes several times of what roundings bring joints apart.
+    assert!(difference(&gpu, &cpu).unwrap() <= 5e-4);
     // The forearm is as long as a UR5's.
     let forearm = |joints: &[f32]| {
         let joint = |i: usize| glam::Vec3::from_slice(&joints[3 * i..]);
