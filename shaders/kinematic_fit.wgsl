@@ -63,6 +63,11 @@ fn direction(vector: vec3<f32>) -> vec3<f32> {
     return vector / max(length(vector), 1e-12);
 }
 
+// Of a link at a right angle to the axis.
+fn level(link: vec3<f32>, axis: vec3<f32>) -> vec3<f32> {
+    return direction(link - dot(link, axis) * axis);
+}
+
 fn turned(vector: vec3<f32>, turn: vec3<f32>) -> vec3<f32> {
     let angle = length(turn);
     let axis = turn / max(angle, 1e-12);
@@ -102,9 +107,9 @@ fn posture_near(links: Links) -> Posture {
     var near = Posture(
         vec3(0.0),
         axis,
-        direction(upper_arm - dot(upper_arm, axis) * axis),
-        direction(forearm - dot(forearm, axis) * axis),
-        direction(wrist - dot(wrist, axis) * axis),
+        level(upper_arm, axis),
+        level(forearm, axis),
+        level(wrist, axis),
     );
     var off = vec3(0.0);
     for (var joint = 0u; joint < JOINTS; joint++) {
@@ -194,12 +199,13 @@ fn solve() {
 fn move_posture() {
     solve();
     let turn = vec3(by[3], by[4], by[5]);
-    let axis = turned(posture.axis, turn);
+    // Links keep their lengths, however roughly a driver works out sines.
+    let axis = direction(turned(posture.axis, turn));
     posture.origin += vec3(by[0], by[1], by[2]);
     posture.axis = axis;
-    posture.upper_arm = turned(posture.upper_arm, turn);
-    posture.forearm = turned(turned(posture.forearm, turn), by[6] * axis);
-    posture.wrist = turned(turned(posture.wrist, turn), by[7] * axis);
+    posture.upper_arm = level(turned(posture.upper_arm, turn), axis);
+    posture.forearm = level(turned(turned(posture.forearm, turn), by[6] * axis), axis);
+    posture.wrist = level(turned(turned(posture.wrist, turn), by[7] * axis), axis);
 }
 
 @compute @workgroup_size(64)

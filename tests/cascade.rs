@@ -296,7 +296,8 @@ fn joints_are_where_the_arm_can_have_them() {
     let on_gpu = |model: &Model| joints(Locator::on_gpu(device(), model, Precision::F32).unwrap());
     let (gpu, cpu) = (on_gpu(&model), joints(Locator::on_cpu(&model)));
     // The fit makes several times of what roundings bring joints apart.
-    assert!(difference(&gpu, &cpu).unwrap() <= 5e-4);
+    let apart = difference(&gpu, &cpu).unwrap();
+    assert!(apart <= 5e-4, "{apart}");
     // The forearm is as long as a UR5's.
     let forearm = |joints: &[f32]| {
         let joint = |i: usize| glam::Vec3::from_slice(&joints[3 * i..]);
