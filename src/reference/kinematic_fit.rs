@@ -86,13 +86,12 @@ impl Posture {
             across
         };
         let axis = (along + across).normalize_or_zero();
-        let level = |link: Vec3| (link - link.dot(axis) * axis).normalize_or_zero();
         let posture = Self {
             origin: Vec3::ZERO,
             axis,
-            upper_arm: level(upper_arm),
-            forearm: level(forearm),
-            wrist: level(wrist_3 - wrist_2),
+            upper_arm: level(upper_arm, axis),
+            forearm: level(forearm, axis),
+            wrist: level(wrist_3 - wrist_2, axis),
         };
         let off = seen.iter().sum::<Vec3>() - posture.joints(links).iter().sum::<Vec3>();
         Self {
@@ -116,15 +115,20 @@ impl Posture {
     fn moved(&self, by: [f32; FREEDOMS]) -> Self {
         let [x, y, z, turn_x, turn_y, turn_z, forearm, wrist] = by;
         let turn = Vec3::new(turn_x, turn_y, turn_z);
-        let axis = turned(self.axis, turn);
+        let axis = turned(self.axis, turn).normalize_or_zero();
         Self {
             origin: self.origin + Vec3::new(x, y, z),
             axis,
-            upper_arm: turned(self.upper_arm, turn),
-            forearm: turned(turned(self.forearm, turn), forearm * axis),
-            wrist: turned(turned(self.wrist, turn), wrist * axis),
+            upper_arm: level(turned(self.upper_arm, turn), axis),
+            forearm: level(turned(turned(self.forearm, turn), forearm * axis), axis),
+            wrist: level(turned(turned(self.wrist, turn), wrist * axis), axis),
         }
     }
+}
+
+/// The direction of a link at a right angle to the axis.
+fn level(link: Vec3, axis: Vec3) -> Vec3 {
+    (link - link.dot(axis) * axis).normalize_or_zero()
 }
 
 /// `vector` turned about `turn`, by its length in radians (Rodrigues).

@@ -79,3 +79,13 @@ def test_of_two_bodies_the_one_that_fits_is_taken():
     for body in (BODY, OTHER):
         truth = arms(body)
         assert mean_error(kinematic_fit.fit(truth, golden.ARM), truth) < 1e-4
+
+
+def test_it_runs_where_the_joints_are():
+    # As on a machine with a GPU, whose tensors are made there unless one says otherwise.
+    truth = arms(BODY, 4)
+    seen, expected = off_by(truth, 0.01), kinematic_fit.fit(off_by(truth, 0.01), golden.ARM)
+    with torch.device("meta"):
+        assert torch.zeros(1).device.type == "meta"
+        assert torch.equal(kinematic_fit.fit(seen, golden.ARM), expected)
+        assert kinematic_fit.arm_of(seen.numpy(), truth.numpy())["bodies"] == [pytest.approx(BODY, abs=1e-5)]

@@ -86,8 +86,8 @@ def fit(joints, arm):
         return fitted
     seen = seen[possible]
     view = _view(seen)
-    whitening = [torch.tensor(arm[part], dtype=torch.float64) for part in ("across", "along")]
-    best, least = seen, torch.full((len(seen),), torch.finfo(torch.float32).max, dtype=torch.float64)
+    whitening = [torch.tensor(arm[part], dtype=torch.float64, device=seen.device) for part in ("across", "along")]
+    best, least = seen, seen.new_full((len(seen),), torch.finfo(torch.float32).max)
     for body in arm["bodies"]:
         links = [body[link] for link in LINKS]
         posture = _start(seen, links)
@@ -174,8 +174,8 @@ def _joints(posture, links):
         origin, shoulder_offset * axis, upper_arm * upper + elbow_offset * axis, forearm_length * forearm, wrist_offset * axis,
         wrist_length * wrist], 1)
     joints = steps.cumsum(1)
-    units = torch.eye(3, dtype=joints.dtype)
-    moved = torch.zeros(*joints.shape, 8, dtype=joints.dtype)
+    units = torch.eye(3, dtype=joints.dtype, device=joints.device)
+    moved = joints.new_zeros(*joints.shape, 8)
     moved[..., :3] = units
     moved[..., 3:6] = torch.linalg.cross(units.expand(*joints.shape, 3).mT, (joints - origin[:, None])[..., None, :]).mT
     moved[:, 3:, :, 6] = forearm_length * torch.linalg.cross(axis, forearm)[:, None]
