@@ -25,10 +25,11 @@ pub struct Plan {
     /// How many frames ran to their end: a `u32`.
     runs: wgpu::Buffer,
     /// What it was in the newest frame whose results were read.
-    seen: u32,
+    last_run: u32,
     /// From the mask to the joint network's input.
     overlay: Vec<Step>,
     joint: NetworkPlan,
+    /// From what the joint network says to the joints.
     behind: Vec<Behind>,
     results: wgpu::Buffer,
     masks: wgpu::Buffer,
@@ -150,7 +151,7 @@ impl Plan {
                 coverage,
                 totals,
                 runs,
-                seen: 0,
+                last_run: 0,
                 overlay,
                 results,
                 masks,
@@ -363,10 +364,10 @@ impl Plan {
         let (joints, rest) = bytes.split_at(self.joints().staging_size() as usize);
         let (totals, runs) = rest.split_at(self.totals.size() as usize);
         let runs: u32 = bytemuck::pod_read_unaligned(runs);
-        if !(1..1 << 31).contains(&runs.wrapping_sub(self.seen)) {
+        if !(1..1 << 31).contains(&runs.wrapping_sub(self.last_run)) {
             return None;
         }
-        self.seen = runs;
+        self.last_run = runs;
         let frames = totals
             .chunks_exact(size_of::<Totals>())
             .zip(self.joints_in(joints))
