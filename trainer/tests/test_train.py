@@ -59,6 +59,20 @@ def test_a_resumed_run_goes_on_as_if_never_stopped(train, monkeypatch):
         assert [row["iteration"] for row in csv.DictReader(file)] == ["3", "6"]
 
 
+def test_a_longer_run_does_not_thaw_the_normalisation(train):
+    flags = ("--precision", "f32", "--crop", "32", "24", "--validation-samples", "2", "--iterations")
+
+    def averages(run):
+        return {key: value.clone() for key, value in _weights(run).items() if "_norm.running" in key}
+
+    first = averages(train("train-mask", "run", *flags, "1"))
+    thawed = averages(train("train-mask", "run", *flags, "6", "--resume"))
+    assert any(not torch.equal(thawed[key], first[key]) for key in first)
+    # Six of forty are less than a quarter again.
+    frozen = averages(train("train-mask", "run", *flags, "40", "--resume"))
+    assert all(torch.equal(frozen[key], thawed[key]) for key in thawed)
+
+
 def test_a_run_is_not_overwritten(train):
     flags = ("--iterations", "1", "--crop", "32", "24", "--validation-samples", "1")
     settings = train("train-mask", "run", *flags) / "settings.json"

@@ -127,13 +127,14 @@ def fit(args, network, numbers, draw, batch_loss, score, card):
     optimizer = make_optimizer(args.optimizer, network, args.weight_decay)
     schedule = Schedule(args.learning_rate, args.momentum)
     order = Order(numbers, args.batch)
-    iteration, before = 0, 0.0
+    iteration, before, frozen = 0, 0.0, False
     last = out / "last.pt"
     if args.resume:
         state = torch.load(last, weights_only=False)
         network.load_state_dict(state["network"])
         optimizer.load_state_dict(state["optimizer"])
         order.state, iteration, before = state["order"], state["iteration"], state["seconds"]
+        frozen = state["frozen"]
         _set_rng_state(state["rng"])
     elif last.exists():
         raise SystemExit(f"{out} holds a run already: add --resume to go on with it, or choose another folder")
@@ -146,7 +147,9 @@ def fit(args, network, numbers, draw, batch_loss, score, card):
     with tqdm(total=1.0, initial=min(progress, 1), bar_format="{l_bar}{bar}| {elapsed} {postfix}", mininterval=10) as bar:
         while progress < 1:
             network.train()
-            if progress >= FREEZE_NORMALISATION:
+            # Once for all: a longer budget than before takes progress back.
+            frozen = frozen or progress >= FREEZE_NORMALISATION
+            if frozen:
                 for module in network.modules():
                     if isinstance(module, torch.nn.BatchNorm2d):
                         module.eval()
@@ -172,8 +175,8 @@ def fit(args, network, numbers, draw, batch_loss, score, card):
                 partial = last.with_suffix(".partial")
                 torch.save({"layers": network.layers, "normalise": network.normalise, "network": network.state_dict(),
                             "card": card, "iteration": iteration, "seconds": seconds, "figures": figures,
-                            "optimizer": optimizer.state_dict(), "order": order.state, "rng": _rng_state()},
-                           partial)
+                            "optimizer": optimizer.state_dict(), "order": order.state, "frozen": frozen,
+                            "rng": _rng_state()}, partial)
                 partial.replace(last)
                 bar.set_postfix({key: figures[key] for key in list(figures)[4:]})
                 seconds = before + time.monotonic() - started
