@@ -207,7 +207,7 @@ class Network(nn.Module):
                 value = nn.functional.interpolate(
                     value, scale_factor=layer["scale"], mode="bilinear", align_corners=False)
             elif op == "concat":
-                value = torch.cat([values[source] for source in layer["inputs"]], 1)
+                value = Concat.apply(*(values[source] for source in layer["inputs"]))
             elif op == "soft_argmax2d":
                 value = soft_argmax2d(value, values[layer["inputs"][1]], layer["origin"], layer["step"])
             elif op == "back_project":
@@ -238,6 +238,20 @@ class Network(nn.Module):
                 convolution.bias.copy_((convolution.bias - norm.running_mean) * scale + norm.bias)
         self.normalise = False
         return self
+
+
+class Concat(torch.autograd.Function):
+    """The inputs' channels one after the other. PyTorch's own gives back slices of one gradient, which layers before it
+    take for the other memory format: eight times as long for an upsampling, a fifth of the mask network's step."""
+
+    @staticmethod
+    def forward(context, *inputs):
+        context.channels = [value.shape[1] for value in inputs]
+        return torch.cat(inputs, 1)
+
+    @staticmethod
+    def backward(context, gradient):
+        return tuple(part.contiguous(memory_format=torch.channels_last) for part in gradient.split(context.channels, 1))
 
 
 def soft_argmax2d(heat, votes, origin, step):
