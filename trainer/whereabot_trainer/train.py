@@ -322,7 +322,7 @@ def train_mask(args):
             images[rows], masks[rows] = torch.from_numpy(negatives[drawn.numpy()]).to(images.device), 0.0
         images, masks = images.to(args.device), masks.to(args.device)
         if args.camera == "fixed":
-            return data.random_crops(data.jitter_colours(images), masks, height, width)
+            return data.random_crops(data.jitter_some_colours(images), masks, height, width)
         return data.mixed_views(images, masks, height, width, args.zoom)
 
     def batch_loss(images, masks):
@@ -476,11 +476,11 @@ def train_joint(args):
     def draw(batch, progress):
         images, masks = samples.bytes(batch)
         images, masks = images.to(args.device), masks.to(args.device)
-        images = (data.jitter_colours if args.camera == "fixed" else data.jitter_some_colours)(images)
+        images = data.jitter_some_colours(images)
         rows = torch.rand(len(batch)) < (args.estimated_masks if progress >= args.estimated_after else 0)
         if rows.any():
             estimates = evaluate.masks_of(mask_network, images[rows], args.precision == "bf16")
-            moved = torch.rand(len(estimates)) < (1 if args.camera == "fixed" else data.VARIED)
+            moved = torch.rand(len(estimates)) < data.VARIED
             if moved.any():
                 estimates[moved] = data.jitter_masks(estimates[moved])
             masks[rows] = estimates
