@@ -14,9 +14,13 @@ pub mod gpu;
 #[cfg(feature = "live")]
 pub mod live;
 pub mod network;
+#[cfg(feature = "recorder")]
+pub mod recorder;
 #[cfg(feature = "recording")]
 pub mod recording;
 pub mod reference;
+#[cfg(feature = "recorder")]
+pub mod robot;
 pub mod verification;
 
 /// Crates whose types are in the API here, in the versions that it has them from.

@@ -12,7 +12,7 @@ use glam::{DAffine3, DMat4, DQuat, DVec3};
 use known::{JOINTS, command};
 use serde_json::{Value, json};
 use tempfile::TempDir;
-use whereabot::recording::Robot;
+use whereabot::robot::Robot;
 
 /// The UR5's joints as `ur_description` has them, with meshes that are not there.
 const URDF: [(&str, &str, &str, &str); 6] = [

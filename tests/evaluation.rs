@@ -21,7 +21,7 @@ use whereabot::evaluation::{
 };
 use whereabot::gpu::Precision;
 use whereabot::network::Model;
-use whereabot::recording::{HEIGHT, INTRINSICS, WIDTH};
+use whereabot::recorder::{HEIGHT, INTRINSICS, WIDTH};
 
 // --- measures ----------------------------------------------------------------------------------------
 

@@ -8,7 +8,9 @@ use clap::error::ErrorKind;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::gpu::{AdapterRequest, Device};
-use crate::recording::{self, PAPER, Protocol, Request, Robot, paper_requests};
+use crate::recorder::{self, PAPER, Request, paper_requests};
+use crate::recording::Protocol;
+use crate::robot::Robot;
 
 /// Render a synthetic recording of a robot: colour images, exact masks, joints
 ///
@@ -165,7 +167,7 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
         if requests.len() > 1 {
             bar.set_message(format!("({})", request.out.display()));
         }
-        recording::record(&device, request, |done| bar.set_position(before + done))
+        recorder::record(&device, request, |done| bar.set_position(before + done))
             .with_context(|| request.out.display().to_string())?;
         before += request.samples;
     }

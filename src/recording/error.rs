@@ -1,8 +1,6 @@
 use std::path::PathBuf;
 
-use crate::gpu::GpuError;
-
-/// Why a recording could not be made, read or continued.
+/// Why a recording could not be read or continued.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum RecordingError {
@@ -13,56 +11,6 @@ pub enum RecordingError {
         path: PathBuf,
         /// What the system said.
         cause: std::io::Error,
-    },
-    /// The robot description is not one that the recorder can use.
-    #[error("{}: {message}", path.display())]
-    Urdf {
-        /// The URDF file.
-        path: PathBuf,
-        /// What was expected and what was found.
-        message: String,
-    },
-    /// What a body's frames file says cannot be used.
-    #[error("{}: {message}", path.display())]
-    Frames {
-        /// The frames file.
-        path: PathBuf,
-        /// What was expected and what was found.
-        message: String,
-    },
-    /// A mesh that the robot description names is not there.
-    #[error("{}: link \"{link}\" wants the mesh \"{name}\", which was not found (looked for {})", urdf.display(), looked_for.display())]
-    MissingMesh {
-        /// The URDF file.
-        urdf: PathBuf,
-        /// The link that wants the mesh.
-        link: String,
-        /// The mesh's name as the URDF gives it.
-        name: String,
-        /// Where it was expected.
-        looked_for: PathBuf,
-    },
-    /// A mesh file could not be understood.
-    #[error("{}: {message}", path.display())]
-    Mesh {
-        /// The mesh file.
-        path: PathBuf,
-        /// What was expected and what was found.
-        message: String,
-    },
-    /// No picture in the folder could be used as a background.
-    #[error("{}: expected at least one readable JPEG or PNG picture, found none", path.display())]
-    NoBackgrounds {
-        /// The folder.
-        path: PathBuf,
-    },
-    /// A background picture could not be decoded.
-    #[error("{}: {cause}", path.display())]
-    Picture {
-        /// The picture.
-        path: PathBuf,
-        /// What the decoder said.
-        cause: image::ImageError,
     },
     /// A recording's header is not what the format asks for.
     #[error("{}: {message}", path.display())]
@@ -96,25 +44,6 @@ pub enum RecordingError {
         /// What is in the way, and what to do.
         message: String,
     },
-    /// No scene that keeps the rules (camera, coverage, no collision) was found.
-    #[error("sample {id}: found no pose without collision that fills the picture as asked")]
-    NoScene {
-        /// The sample's number.
-        id: u64,
-    },
-    /// A sweep of the joints has too few poses that a fixed camera can see.
-    #[error(
-        "expected {wanted} poses without collision and with all joints in the picture, found {found}"
-    )]
-    TooFewPoses {
-        /// How many samples were asked for.
-        wanted: usize,
-        /// How many poses there are.
-        found: usize,
-    },
-    /// The GPU could not draw.
-    #[error(transparent)]
-    Gpu(#[from] GpuError),
 }
 
 impl RecordingError {

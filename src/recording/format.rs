@@ -4,23 +4,19 @@ use std::fs::{File, TryLockError};
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 
-use image::codecs::jpeg::JpegEncoder;
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{ExtendedColorType, ImageEncoder};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use super::RecordingError;
 use super::reader::parse;
-use super::render::Picture;
-use super::{HEIGHT, RecordingError, WIDTH};
 use crate::camera::Intrinsics;
 
 /// The header's `format`.
-pub(super) const FORMAT: &str = "whereabot-recording";
+pub const FORMAT: &str = "whereabot-recording";
 /// The header's `version`.
-pub(super) const VERSION: u32 = 1;
+pub const VERSION: u32 = 1;
 /// The header's `frame`.
-pub(super) const FRAME: &str = "camera_optical";
+pub const FRAME: &str = "camera_optical";
 
 /// `recording.json`: what all samples of a recording have in common.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -267,31 +263,4 @@ fn difference(expected: &Header, found: &Header) -> Option<String> {
         let (expected, found) = (of(&expected, key), of(&found, key));
         (expected != found).then(|| format!("{key}: expected {expected}, found {found}"))
     })
-}
-
-/// Writes a picture as sample `id`'s image (JPEG, quality 92) and mask (PNG).
-///
-/// # Errors
-/// A file cannot be written.
-pub fn write_picture(
-    folder: &Path,
-    sample: &Sample,
-    picture: &Picture,
-) -> Result<(), RecordingError> {
-    let mut jpeg = Vec::new();
-    let image_path = folder.join(&sample.image);
-    let mask_path = folder.join(&sample.mask);
-    let failed = |path: &Path| {
-        let path = path.to_owned();
-        move |cause| RecordingError::Picture { path, cause }
-    };
-    JpegEncoder::new_with_quality(&mut jpeg, 92)
-        .write_image(&picture.rgb, WIDTH, HEIGHT, ExtendedColorType::Rgb8)
-        .map_err(failed(&image_path))?;
-    let mut png = Vec::new();
-    PngEncoder::new_with_quality(&mut png, CompressionType::Fast, FilterType::NoFilter)
-        .write_image(&picture.mask, WIDTH, HEIGHT, ExtendedColorType::L8)
-        .map_err(failed(&mask_path))?;
-    std::fs::write(&image_path, jpeg).map_err(RecordingError::io(&image_path))?;
-    std::fs::write(&mask_path, png).map_err(RecordingError::io(&mask_path))
 }

@@ -10,7 +10,7 @@ use serde::Serialize;
 use serde_json::Value;
 
 use super::frames::Frame;
-use crate::recording::Robot;
+use crate::robot::Robot;
 
 /// A row: a pose of the robot.
 struct Row {
@@ -244,7 +244,7 @@ fn row(value: &Value, robot: &Robot) -> anyhow::Result<Row> {
         Some(part("sec")? + 1e-9 * part("nanosec")?)
     });
     let names = list("name");
-    let angle = |(index, joint): (usize, &crate::recording::Joint)| {
+    let angle = |(index, joint): (usize, &crate::robot::Joint)| {
         let full = format!("{}_joint", joint.name);
         let found = if let Some(angles) = list("joint_angles_rad") {
             angles.get(index)

@@ -14,7 +14,7 @@ use glam::DVec3;
 
 use crate::calibration::{Pair, Registration, register};
 use crate::live::ros;
-use crate::recording::{Frames, Robot};
+use crate::robot::{Frames, Robot};
 use angles::Angles;
 use frames::Frame;
 use report::{Report, Residual};

@@ -1,5 +1,5 @@
 //! The recorder: kinematics, meshes, collisions, projection, and recordings on disk.
-#![cfg(feature = "recording")]
+#![cfg(feature = "recorder")]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, missing_docs)]
 
 mod common;
@@ -11,11 +11,12 @@ use glam::{DAffine3, DVec3};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use tempfile::TempDir;
-use whereabot::recording::{
-    CollisionModel, Effects, Frames, HEIGHT, Header, INTRINSICS, Item, Kind, Lamp, Lighting,
-    Material, Mesh, Picture, Protocol, Reader, RecordingError, Renderer, Request, Robot, Sample,
-    Scene, Shot, Stage, WIDTH, Window, Writer, paper_requests, record,
+use whereabot::recorder::{
+    CollisionModel, Effects, HEIGHT, INTRINSICS, Item, Kind, Lamp, Lighting, Material, Picture,
+    RecorderError, Renderer, Request, Scene, Shot, Stage, WIDTH, Window, paper_requests, record,
 };
+use whereabot::recording::{Header, Protocol, Reader, Sample, Writer};
+use whereabot::robot::{Frames, Mesh, Robot, RobotError};
 
 fn arm_urdf() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/arm/arm.urdf")
@@ -345,7 +346,7 @@ fn a_missing_mesh_is_named() {
     let package = arm_urdf().parent().unwrap().to_owned();
     let packages = [("arm".to_owned(), package)];
     match Robot::load(&urdf, &packages).unwrap_err() {
-        RecordingError::MissingMesh {
+        RobotError::MissingMesh {
             link,
             name,
             looked_for,
@@ -362,7 +363,7 @@ fn a_missing_mesh_is_named() {
     // Without the package's place, and with no such folder above the URDF.
     assert!(matches!(
         Robot::load(&urdf, &[]),
-        Err(RecordingError::MissingMesh { .. })
+        Err(RobotError::MissingMesh { .. })
     ));
 }
 
@@ -928,7 +929,7 @@ fn a_fixed_camera_needs_poses_it_can_see() {
     fs::write(&request.urdf, stiff).unwrap();
     let error = record(&common::device(), &request, |_| {}).unwrap_err();
     assert!(
-        matches!(error, RecordingError::TooFewPoses { wanted: 2, .. }),
+        matches!(error, RecorderError::TooFewPoses { wanted: 2, .. }),
         "{error}"
     );
     assert!(!request.out.exists());
@@ -1070,12 +1071,12 @@ fn backgrounds_must_exist() {
     let device = common::device();
     let request = request(folder.path(), "out");
     let error = record(&device, &request, |_| {}).unwrap_err();
-    assert!(matches!(error, RecordingError::Io { .. }), "{error}");
+    assert!(matches!(error, RecorderError::Io { .. }), "{error}");
     fs::create_dir(&request.backgrounds).unwrap();
     fs::write(request.backgrounds.join("a.jpg"), "no picture").unwrap();
     let error = record(&device, &request, |_| {}).unwrap_err();
     assert!(
-        matches!(error, RecordingError::NoBackgrounds { .. }),
+        matches!(error, RecorderError::NoBackgrounds { .. }),
         "{error}"
     );
     assert!(!request.out.exists());

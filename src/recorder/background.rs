@@ -7,7 +7,7 @@ use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
-use super::{HEIGHT, RecordingError, WIDTH};
+use super::{HEIGHT, RecorderError, WIDTH};
 
 /// A random view of one photo.
 #[derive(Debug, Clone)]
@@ -54,10 +54,10 @@ impl Backgrounds {
     ///
     /// # Errors
     /// The folder cannot be read or holds no readable picture.
-    pub fn open(folder: &Path) -> Result<Backgrounds, RecordingError> {
+    pub fn open(folder: &Path) -> Result<Backgrounds, RecorderError> {
         let mut paths = Vec::new();
-        for entry in std::fs::read_dir(folder).map_err(RecordingError::io(folder))? {
-            let path = entry.map_err(RecordingError::io(folder))?.path();
+        for entry in std::fs::read_dir(folder).map_err(RecorderError::io(folder))? {
+            let path = entry.map_err(RecorderError::io(folder))?.path();
             let extension = path
                 .extension()
                 .and_then(|e| e.to_str())
@@ -80,7 +80,7 @@ impl Backgrounds {
         let mut readable = readable.into_iter();
         paths.retain(|_| readable.next().unwrap_or(false));
         if paths.is_empty() {
-            return Err(RecordingError::NoBackgrounds {
+            return Err(RecorderError::NoBackgrounds {
                 path: folder.to_owned(),
             });
         }
@@ -99,9 +99,9 @@ impl Backgrounds {
     ///
     /// # Errors
     /// The photo can no longer be read, or the view was drawn for more photos than there are.
-    pub fn view(&self, view: &PhotoView) -> Result<Vec<u8>, RecordingError> {
+    pub fn view(&self, view: &PhotoView) -> Result<Vec<u8>, RecorderError> {
         let Some(path) = self.paths.get(view.photo) else {
-            return Err(RecordingError::NoBackgrounds {
+            return Err(RecorderError::NoBackgrounds {
                 path: self.folder.clone(),
             });
         };
@@ -191,13 +191,13 @@ fn resample(photo: &RgbImage, step: f64, place: [f64; 2], mirrored: bool) -> Rgb
     out
 }
 
-fn decode(path: &Path) -> Result<RgbImage, RecordingError> {
+fn decode(path: &Path) -> Result<RgbImage, RecorderError> {
     let picture = image::ImageReader::open(path)
         .and_then(image::ImageReader::with_guessed_format)
-        .map_err(RecordingError::io(path))?
+        .map_err(RecorderError::io(path))?
         .decode();
     Ok(picture
-        .map_err(|cause| RecordingError::Picture {
+        .map_err(|cause| RecorderError::Picture {
             path: path.to_owned(),
             cause,
         })?

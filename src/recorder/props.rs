@@ -8,8 +8,8 @@ use rand::seq::IndexedRandom;
 use rand_chacha::ChaCha8Rng;
 
 use super::chance::{any_colour, direction, grey, hsv, normal};
-use super::mesh::Mesh;
 use super::scene::{Item, Kind, Lamp, Lighting, Material};
+use crate::robot::Mesh;
 
 /// The meshes that props are made of: they come first among a stage's meshes.
 pub(super) const PRIMITIVES: [fn() -> Mesh; 3] = [Mesh::cuboid, Mesh::cylinder, Mesh::sphere];

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use glam::{Affine3A, DAffine3, DMat3, DQuat, DVec3, Vec3};
 use urdf_rs::{Geometry, JointType};
 
-use super::RecordingError;
+use super::RobotError;
 use super::mesh::Mesh;
 
 /// A link's meshes, in the link's own frame.
@@ -58,9 +58,9 @@ impl Frames {
     ///
     /// # Errors
     /// The file cannot be read, or is no such JSON (the error names the line).
-    pub fn read(path: &Path) -> Result<Frames, RecordingError> {
-        let text = std::fs::read_to_string(path).map_err(RecordingError::io(path))?;
-        serde_json::from_str(&text).map_err(|cause| RecordingError::Frames {
+    pub fn read(path: &Path) -> Result<Frames, RobotError> {
+        let text = std::fs::read_to_string(path).map_err(RobotError::io(path))?;
+        serde_json::from_str(&text).map_err(|cause| RobotError::Frames {
             path: path.to_owned(),
             message: cause.to_string(),
         })
@@ -99,7 +99,7 @@ impl Robot {
     /// # Errors
     /// A file is missing or unreadable (the error names it), or the URDF has no revolute joint, or its
     /// joints do not form a tree.
-    pub fn load(urdf: &Path, packages: &[(String, PathBuf)]) -> Result<Robot, RecordingError> {
+    pub fn load(urdf: &Path, packages: &[(String, PathBuf)]) -> Result<Robot, RobotError> {
         Self::read(urdf, Some(packages))
     }
 
@@ -107,13 +107,13 @@ impl Robot {
     ///
     /// # Errors
     /// As [`Robot::load`], but for meshes.
-    pub fn kinematics(urdf: &Path) -> Result<Robot, RecordingError> {
+    pub fn kinematics(urdf: &Path) -> Result<Robot, RobotError> {
         Self::read(urdf, None)
     }
 
     /// Without `packages` meshes are left alone.
-    fn read(urdf: &Path, packages: Option<&[(String, PathBuf)]>) -> Result<Robot, RecordingError> {
-        let mut text = std::fs::read_to_string(urdf).map_err(RecordingError::io(urdf))?;
+    fn read(urdf: &Path, packages: Option<&[(String, PathBuf)]>) -> Result<Robot, RobotError> {
+        let mut text = std::fs::read_to_string(urdf).map_err(RobotError::io(urdf))?;
         // Drake's attributes mostly come without the declaration that XML wants.
         if text.contains(" drake:") && !text.contains("xmlns:drake") {
             text = text.replacen(
@@ -122,7 +122,7 @@ impl Robot {
                 1,
             );
         }
-        let fail = |message: String| RecordingError::Urdf {
+        let fail = |message: String| RobotError::Urdf {
             path: urdf.to_owned(),
             message,
         };
@@ -316,7 +316,7 @@ impl Robot {
 
     /// The arm as a line through its links' middles, base first: from each joint's point to the nearest
     /// point of the next one's axis, then along that axis.
-    pub(super) fn spine(&self, link_poses: &[DAffine3]) -> Vec<DVec3> {
+    pub(crate) fn spine(&self, link_poses: &[DAffine3]) -> Vec<DVec3> {
         let base = link_poses.get(self.base).copied().unwrap_or_default();
         let mut at = base.translation;
         let mut spine = vec![at];
@@ -371,7 +371,7 @@ impl Files<'_> {
         &self,
         geometry: &Geometry,
         origin: &urdf_rs::Pose,
-    ) -> Result<Vec<Mesh>, RecordingError> {
+    ) -> Result<Vec<Mesh>, RobotError> {
         let size = |v: [f64; 3]| Affine3A::from_scale(Vec3::from(v.map(|c| c as f32)));
         let (mut meshes, scale) = match geometry {
             Geometry::Box { size: edges } => (vec![Mesh::cuboid()], size(**edges)),
@@ -393,9 +393,9 @@ impl Files<'_> {
     }
 
     /// The file that a URDF's mesh name means.
-    fn find(&self, name: &str) -> Result<PathBuf, RecordingError> {
+    fn find(&self, name: &str) -> Result<PathBuf, RobotError> {
         let folder = self.urdf.parent().unwrap_or(Path::new(""));
-        let missing = |looked_for: PathBuf| RecordingError::MissingMesh {
+        let missing = |looked_for: PathBuf| RobotError::MissingMesh {
             urdf: self.urdf.to_owned(),
             link: self.link.to_owned(),
             name: name.to_owned(),
@@ -418,7 +418,7 @@ impl Files<'_> {
                 Err(missing(path))
             };
         }
-        let absolute = std::path::absolute(folder).map_err(RecordingError::io(folder))?;
+        let absolute = std::path::absolute(folder).map_err(RobotError::io(folder))?;
         absolute
             .ancestors()
             .flat_map(|up| [up.join(rest), up.join(inside)])

@@ -7,7 +7,7 @@ use std::path::Path;
 use glam::{Affine3A, Mat4, Vec3};
 use roxmltree::{Document, Node};
 
-use super::RecordingError;
+use super::RobotError;
 
 /// A triangle list of one material.
 #[derive(Debug, Clone, Default)]
@@ -27,7 +27,7 @@ impl Mesh {
     ///
     /// # Errors
     /// The file cannot be read, is of another kind, or breaks its format's rules.
-    pub fn read(path: &Path) -> Result<Vec<Mesh>, RecordingError> {
+    pub fn read(path: &Path) -> Result<Vec<Mesh>, RobotError> {
         let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("");
         let meshes = match extension.to_ascii_lowercase().as_str() {
             "dae" => read_collada(path)?,
@@ -143,17 +143,17 @@ impl Mesh {
     }
 }
 
-fn broken(path: &Path, message: impl Into<String>) -> RecordingError {
-    RecordingError::Mesh {
+fn broken(path: &Path, message: impl Into<String>) -> RobotError {
+    RobotError::Mesh {
         path: path.to_owned(),
         message: message.into(),
     }
 }
 
-fn read_with_mesh_loader(path: &Path) -> Result<Vec<Mesh>, RecordingError> {
+fn read_with_mesh_loader(path: &Path) -> Result<Vec<Mesh>, RobotError> {
     let scene = mesh_loader::Loader::default()
         .load(path)
-        .map_err(RecordingError::io(path))?;
+        .map_err(RobotError::io(path))?;
     let meshes = scene.meshes.iter().zip(&scene.materials);
     Ok(meshes
         .filter(|(mesh, _)| !mesh.faces.is_empty())
@@ -219,8 +219,8 @@ fn numbers<T: std::str::FromStr>(node: Element<'_>) -> Option<Vec<T>> {
 
 /// A COLLADA file: `triangles` and `polylist` primitives with positions and normals, placed by the
 /// visual scene's nodes. The unit is honoured; the up axis is not, as ROS tools ignore it.
-fn read_collada(path: &Path) -> Result<Vec<Mesh>, RecordingError> {
-    let text = std::fs::read_to_string(path).map_err(RecordingError::io(path))?;
+fn read_collada(path: &Path) -> Result<Vec<Mesh>, RobotError> {
+    let text = std::fs::read_to_string(path).map_err(RobotError::io(path))?;
     let document = Document::parse(&text).map_err(|e| broken(path, format!("not XML: {e}")))?;
     let root = document.root_element();
     let by_id: HashMap<&str, Element<'_>> = root
@@ -247,11 +247,11 @@ struct Collada<'a> {
 }
 
 impl<'a> Collada<'a> {
-    fn error(&self, message: impl Into<String>) -> RecordingError {
+    fn error(&self, message: impl Into<String>) -> RobotError {
         broken(self.path, message)
     }
 
-    fn follow(&self, url: Option<&str>) -> Result<Element<'a>, RecordingError> {
+    fn follow(&self, url: Option<&str>) -> Result<Element<'a>, RobotError> {
         let url = url.unwrap_or("");
         self.by_id
             .get(url.trim_start_matches('#'))
@@ -264,7 +264,7 @@ impl<'a> Collada<'a> {
         node: Element<'a>,
         parent: Affine3A,
         meshes: &mut Vec<Mesh>,
-    ) -> Result<(), RecordingError> {
+    ) -> Result<(), RobotError> {
         let mut pose = parent;
         for element in node.children().filter(Node::is_element) {
             let name = element.tag_name().name();
@@ -299,7 +299,7 @@ impl<'a> Collada<'a> {
         &self,
         geometry: Element<'a>,
         instance: Element<'a>,
-    ) -> Result<Vec<Mesh>, RecordingError> {
+    ) -> Result<Vec<Mesh>, RobotError> {
         let Some(mesh) = child(geometry, "mesh") else {
             return Ok(Vec::new());
         };
@@ -333,14 +333,14 @@ impl<'a> Collada<'a> {
         }
     }
 
-    fn vectors(&self, source: Element<'a>) -> Result<Vec<[f32; 3]>, RecordingError> {
+    fn vectors(&self, source: Element<'a>) -> Result<Vec<[f32; 3]>, RobotError> {
         let array = child(source, "float_array")
             .and_then(numbers::<f32>)
             .ok_or_else(|| self.error("a <source> without a readable <float_array>"))?;
         Ok(array.as_chunks::<3>().0.to_vec())
     }
 
-    fn primitive(&self, primitive: Element<'a>) -> Result<Mesh, RecordingError> {
+    fn primitive(&self, primitive: Element<'a>) -> Result<Mesh, RobotError> {
         let mut stride = 0;
         let mut positions = None;
         let mut normals = None;
@@ -399,7 +399,7 @@ impl<'a> Collada<'a> {
                 .ok_or_else(|| self.error(format!("index {index} beyond the positions")))
         };
         let Some((normal_at, normals)) = normals else {
-            let corners: Result<Vec<[[f32; 3]; 3]>, RecordingError> = triangles
+            let corners: Result<Vec<[[f32; 3]; 3]>, RobotError> = triangles
                 .iter()
                 .map(|t| Ok([position(t[0])?, position(t[1])?, position(t[2])?]))
                 .collect();

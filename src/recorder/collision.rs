@@ -7,7 +7,7 @@ use parry3d::shape::TriMesh;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::robot::Robot;
+use crate::robot::Robot;
 
 /// Finds poses that collide, on the links' collision meshes.
 pub struct CollisionModel {

@@ -5,7 +5,7 @@ use rand::seq::IndexedRandom;
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::render::Picture;
+use super::picture::Picture;
 use super::{HEIGHT, WIDTH};
 
 /// The part of the picture that the camera's image fills, black outside: images of other shapes are

@@ -4,10 +4,11 @@ use bytemuck::{Pod, Zeroable};
 use glam::{DAffine3, DVec3, Mat4, Vec3, Vec4};
 use wgpu::util::DeviceExt;
 
-use super::mesh::Mesh;
+use super::picture::Picture;
 use super::scene::{Item, Kind, Scene};
-use super::{HEIGHT, INTRINSICS, RecordingError, WIDTH};
+use super::{HEIGHT, INTRINSICS, RecorderError, WIDTH};
 use crate::gpu::{Device, GpuError};
+use crate::robot::Mesh;
 
 const SAMPLES: u32 = 4;
 const COLOUR: wgpu::TextureFormat = wgpu::TextureFormat::Rgba8Unorm;
@@ -19,14 +20,6 @@ const SHADOW_REACH: f32 = 1.5;
 /// Nearest and farthest distance drawn, metres.
 const NEAR: f64 = 0.05;
 const FAR: f64 = 30.0;
-
-/// What the camera sees of a scene: `WIDTH` x `HEIGHT` pixels, row by row from the top left.
-pub struct Picture {
-    /// RGB bytes, sRGB-encoded.
-    pub rgb: Vec<u8>,
-    /// 255 where the robot covers at least half of the pixel, else 0.
-    pub mask: Vec<u8>,
-}
 
 #[repr(C)]
 #[derive(Clone, Copy, Pod, Zeroable)]
@@ -99,7 +92,7 @@ impl<'a> Renderer<'a> {
     ///
     /// # Errors
     /// The device rejects a pipeline or a buffer.
-    pub fn new(device: &'a Device, meshes: &[Mesh]) -> Result<Renderer<'a>, RecordingError> {
+    pub fn new(device: &'a Device, meshes: &[Mesh]) -> Result<Renderer<'a>, RecorderError> {
         Ok(device.scoped(|| Ok(Self::build(device, meshes)))?)
     }
 
@@ -357,7 +350,7 @@ impl<'a> Renderer<'a> {
         scene: &Scene,
         background: &[u8],
         texture: Option<&[u8]>,
-    ) -> Result<Picture, RecordingError> {
+    ) -> Result<Picture, RecorderError> {
         let (device, queue) = (self.device.wgpu(), self.device.queue());
         self.device
             .require("items in a scene", scene.items.len() as u64, ITEMS as u64)?;

@@ -13,12 +13,11 @@ use super::background::PhotoView;
 use super::chance::{direction, grey, hsv, normal};
 use super::collision::CollisionModel;
 use super::effects::{Effects, Window};
-use super::mesh::Mesh;
 use super::props::{Builder, MATT, PRIMITIVES, Support, lighting, line_distance};
-use super::robot::{Frames, Robot};
 use super::scene::{Item, Kind, Material, Scene};
 use super::sweep::Sweep;
-use super::{HEIGHT, INTRINSICS, RecordingError, WIDTH};
+use super::{HEIGHT, INTRINSICS, RecorderError, WIDTH};
+use crate::robot::{Frames, Mesh, Robot, RobotError};
 
 /// The robot's part in a shot.
 #[derive(Debug, Clone)]
@@ -227,7 +226,7 @@ impl Stage {
         urdf: &Path,
         packages: &[(String, PathBuf)],
         bodies: &[(PathBuf, PathBuf)],
-    ) -> Result<Stage, RecordingError> {
+    ) -> Result<Stage, RecorderError> {
         let mut meshes: Vec<Mesh> = PRIMITIVES.iter().map(|make| make()).collect();
         let main = Body::load(Robot::load(urdf, packages)?, &mut meshes);
         let names = |robot: &Robot| -> Vec<String> {
@@ -238,18 +237,19 @@ impl Stage {
             let mut robot = Robot::load(urdf, packages)?;
             let (expected, found) = (names(&main.robot), names(&robot));
             if found != expected {
-                return Err(RecordingError::Urdf {
+                return Err(RobotError::Urdf {
                     path: urdf.clone(),
                     message: format!(
                         "expected the robot's joints ({}), found {}",
                         expected.join(", "),
                         found.join(", ")
                     ),
-                });
+                }
+                .into());
             }
             robot
                 .set_frames(&Frames::read(frames)?)
-                .map_err(|message| RecordingError::Frames {
+                .map_err(|message| RobotError::Frames {
                     path: frames.clone(),
                     message: format!("{message} in {}", urdf.display()),
                 })?;
@@ -291,7 +291,7 @@ impl Stage {
         id: u64,
         cameras: usize,
         photos: usize,
-    ) -> Result<Vec<Shot>, RecordingError> {
+    ) -> Result<Vec<Shot>, RecorderError> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         rng.set_stream(id);
         let mut look = ChaCha8Rng::from_rng(&mut rng);
@@ -343,7 +343,7 @@ impl Stage {
                 return Ok(self.dress(views, support, &arms, &mut look, &mut rng, photos));
             }
         }
-        Err(RecordingError::NoScene { id })
+        Err(RecorderError::NoScene { id })
     }
 
     /// Sample `id` of a recording with fixed cameras, a shot a camera: the photos behind the robot and the
@@ -356,10 +356,10 @@ impl Stage {
         station: &Station,
         id: u64,
         photos: usize,
-    ) -> Result<Vec<Shot>, RecordingError> {
+    ) -> Result<Vec<Shot>, RecorderError> {
         let pose = usize::try_from(id).ok().and_then(|i| station.poses.get(i));
         let Some(angles) = pose else {
-            return Err(RecordingError::NoScene { id });
+            return Err(RecorderError::NoScene { id });
         };
         let arm = self.main.arm(angles.clone());
         let mut rng = ChaCha8Rng::seed_from_u64(station.seed);
@@ -405,7 +405,7 @@ impl Stage {
         seed: u64,
         cameras: usize,
         samples: usize,
-    ) -> Result<Station, RecordingError> {
+    ) -> Result<Station, RecorderError> {
         let mut cameras_from_base: Vec<DAffine3> = Vec::new();
         for _ in 0..cameras {
             let camera = self.station_camera(seed, &cameras_from_base);
@@ -432,7 +432,7 @@ impl Stage {
             let finer = Sweep::new(&self.main.robot, wanted.max(sweep.len() + 1));
             // A robot whose joints cannot turn has no finer sweep.
             if sweep.len() > POINTS.saturating_mul(samples) || finer == sweep {
-                return Err(RecordingError::TooFewPoses {
+                return Err(RecorderError::TooFewPoses {
                     wanted: samples,
                     found: poses.len(),
                 });

@@ -2,7 +2,7 @@
 
 use std::f64::consts::TAU;
 
-use super::robot::Robot;
+use crate::robot::Robot;
 
 /// A grid over the joints' ranges. From one point to the next, one joint moves by one step: the last
 /// joint goes to and fro within the strokes of the one before it, and so on to the first.
