@@ -1,5 +1,7 @@
 // Moves six joints to where an arm can have them: `reference::kinematic_fit`, in the same steps. A workgroup an image; each of
 // its first nine invocations brings forth a column of the errors' changes, or the errors themselves.
+//
+// Functions are called from as few places as can be: drivers write them out at each, and compile that before the first image.
 
 override BODIES: u32;
 
@@ -24,10 +26,13 @@ struct Links {
 struct Posture {
     origin: vec3<f32>,
     axis: vec3<f32>,
-    upper_arm: vec3<f32>,
-    forearm: vec3<f32>,
-    wrist: vec3<f32>,
+    // Unit vectors at right angles to the axis.
+    limbs: array<vec3<f32>, 3>,
 }
+
+const UPPER_ARM = 0u;
+const FOREARM = 1u;
+const WRIST = 2u;
 
 // The links of each body, then `across` and `along`, row by row.
 @group(0) @binding(3) var<storage, read> arm: array<f32>;
@@ -36,11 +41,13 @@ var<workgroup> seen: array<vec3<f32>, JOINTS>;
 var<workgroup> sight: vec3<f32>;
 var<workgroup> mean_depth: f32;
 var<workgroup> posture: Posture;
+// Where that has the joints.
+var<workgroup> places: array<vec3<f32>, JOINTS>;
 // Each column as it is, and whitened.
 var<workgroup> plain: array<array<vec4<f32>, JOINTS>, COLUMNS>;
 var<workgroup> columns: array<array<vec4<f32>, JOINTS>, COLUMNS>;
-// The normal equations, and what solves them.
-var<workgroup> rows: array<array<f32, COLUMNS>, FREEDOMS>;
+// The normal equations, below them the errors' own product, and what solves them.
+var<workgroup> rows: array<array<f32, COLUMNS>, COLUMNS>;
 var<workgroup> by: array<f32, FREEDOMS>;
 var<workgroup> best: array<vec3<f32>, JOINTS>;
 
@@ -74,27 +81,27 @@ fn turned(vector: vec3<f32>, turn: vec3<f32>) -> vec3<f32> {
     return vector * cos(angle) + cross(axis, vector) * sin(angle) + axis * (dot(axis, vector) * (1.0 - cos(angle)));
 }
 
-fn joint_of(posture: Posture, links: Links, joint: u32) -> vec3<f32> {
+fn joint_of(links: Links, joint: u32) -> vec3<f32> {
     var place = posture.origin;
     if joint >= 1u {
         place += links.shoulder_offset * posture.axis;
     }
     if joint >= 2u {
-        place += links.upper_arm * posture.upper_arm + links.elbow_offset * posture.axis;
+        place += links.upper_arm * posture.limbs[UPPER_ARM] + links.elbow_offset * posture.axis;
     }
     if joint >= 3u {
-        place += links.forearm * posture.forearm;
+        place += links.forearm * posture.limbs[FOREARM];
     }
     if joint >= 4u {
         place += links.wrist_offset * posture.axis;
     }
     if joint >= 5u {
-        place += links.wrist * posture.wrist;
+        place += links.wrist * posture.limbs[WRIST];
     }
     return place;
 }
 
-fn posture_near(links: Links) -> Posture {
+fn assume_posture(links: Links) {
     let along = direction(links.shoulder_offset * (seen[1] - seen[0]) + links.wrist_offset * (seen[4] - seen[3]));
     let upper_arm = seen[2] - seen[1] - links.elbow_offset * along;
     let forearm = seen[3] - seen[2];
@@ -103,20 +110,18 @@ fn posture_near(links: Links) -> Posture {
         across = -across;
     }
     let axis = direction(along + across);
-    let wrist = seen[5] - seen[4];
-    var near = Posture(
-        vec3(0.0),
-        axis,
-        level(upper_arm, axis),
-        level(forearm, axis),
-        level(wrist, axis),
-    );
-    var off = vec3(0.0);
-    for (var joint = 0u; joint < JOINTS; joint++) {
-        off += seen[joint] - joint_of(near, links, joint);
+    var limbs = array(upper_arm, forearm, seen[5] - seen[4]);
+    // Of as many joints each link is a part.
+    let lengths = array(4.0 * links.upper_arm, 3.0 * links.forearm, links.wrist);
+    var off = -(5.0 * links.shoulder_offset + 4.0 * links.elbow_offset + 2.0 * links.wrist_offset) * axis;
+    for (var limb = 0u; limb < 3u; limb++) {
+        limbs[limb] = level(limbs[limb], axis);
+        off -= lengths[limb] * limbs[limb];
     }
-    near.origin = off / f32(JOINTS);
-    return near;
+    for (var joint = 0u; joint < JOINTS; joint++) {
+        off += seen[joint];
+    }
+    posture = Posture(off / f32(JOINTS), axis, limbs);
 }
 
 fn depth_of(joint: vec3<f32>) -> f32 {
@@ -124,16 +129,14 @@ fn depth_of(joint: vec3<f32>) -> f32 {
 }
 
 // How far a joint is from where it is seen.
-fn error(links: Links, joint: u32) -> vec4<f32> {
-    let place = joint_of(posture, links, joint);
+fn error(place: vec3<f32>, joint: u32) -> vec4<f32> {
     let depth = depth_of(place);
     let seen_depth = depth_of(seen[joint]);
     return vec4(mean_depth * (place / depth - seen[joint] / seen_depth), log(depth / seen_depth));
 }
 
 // How that changes with a freedom.
-fn change(links: Links, freedom: u32, joint: u32) -> vec4<f32> {
-    let place = joint_of(posture, links, joint);
+fn change(place: vec3<f32>, links: Links, freedom: u32, joint: u32) -> vec4<f32> {
     var moved = vec3(0.0);
     if freedom < 3u {
         moved[freedom] = 1.0;
@@ -142,9 +145,9 @@ fn change(links: Links, freedom: u32, joint: u32) -> vec4<f32> {
         unit[freedom - 3u] = 1.0;
         moved = cross(unit, place - posture.origin);
     } else if freedom == 6u && joint >= 3u {
-        moved = links.forearm * cross(posture.axis, posture.forearm);
+        moved = links.forearm * cross(posture.axis, posture.limbs[FOREARM]);
     } else if freedom == 7u && joint == 5u {
-        moved = links.wrist * cross(posture.axis, posture.wrist);
+        moved = links.wrist * cross(posture.axis, posture.limbs[WRIST]);
     }
     let depth = depth_of(place);
     let nearer = dot(sight, moved) / depth;
@@ -153,10 +156,11 @@ fn change(links: Links, freedom: u32, joint: u32) -> vec4<f32> {
 
 fn bring_forth(column: u32, links: Links) {
     for (var joint = 0u; joint < JOINTS; joint++) {
+        let place = places[joint];
         if column == FREEDOMS {
-            plain[column][joint] = error(links, joint);
+            plain[column][joint] = error(place, joint);
         } else {
-            plain[column][joint] = change(links, column, joint);
+            plain[column][joint] = change(place, links, column, joint);
         }
     }
     for (var i = 0u; i < JOINTS; i++) {
@@ -199,13 +203,15 @@ fn solve() {
 fn move_posture() {
     solve();
     let turn = vec3(by[3], by[4], by[5]);
-    // Links keep their lengths, however roughly a driver works out sines.
-    let axis = direction(turned(posture.axis, turn));
     posture.origin += vec3(by[0], by[1], by[2]);
-    posture.axis = axis;
-    posture.upper_arm = level(turned(posture.upper_arm, turn), axis);
-    posture.forearm = level(turned(turned(posture.forearm, turn), by[6] * axis), axis);
-    posture.wrist = level(turned(turned(posture.wrist, turn), by[7] * axis), axis);
+    // Links keep their lengths, however roughly a driver works out sines.
+    posture.axis = direction(turned(posture.axis, turn));
+    for (var limb = 0u; limb < 3u; limb++) {
+        // The upper arm turns with the whole alone.
+        let bend = select(by[5u + limb], 0.0, limb == UPPER_ARM);
+        let turned_limb = turned(turned(posture.limbs[limb], turn), bend * posture.axis);
+        posture.limbs[limb] = level(turned_limb, posture.axis);
+    }
 }
 
 @compute @workgroup_size(64)
@@ -245,36 +251,40 @@ fn main(
     for (var body = 0u; body < BODIES; body++) {
         let links = links_of(body);
         if lane == 0u {
-            posture = posture_near(links);
+            assume_posture(links);
         }
-        for (var iteration = 0u; iteration < STEPS; iteration++) {
+        // One more than steps: for the errors that remain.
+        for (var iteration = 0u; iteration <= STEPS; iteration++) {
+            workgroupBarrier();
+            if lane < JOINTS {
+                places[lane] = joint_of(links, lane);
+            }
             workgroupBarrier();
             if lane < COLUMNS {
                 bring_forth(lane, links);
             }
             workgroupBarrier();
-            for (var entry = lane; entry < FREEDOMS * COLUMNS; entry += 64u) {
+            for (var entry = lane; entry < COLUMNS * COLUMNS; entry += 64u) {
                 let i = entry / COLUMNS;
                 let j = entry % COLUMNS;
                 let sum = product(i, j);
-                rows[i][j] = select(select(sum, -sum, j == FREEDOMS), (1.0 + DAMPING) * sum, i == j);
+                let signed = select(sum, -sum, j == FREEDOMS && i < FREEDOMS);
+                rows[i][j] = select(signed, (1.0 + DAMPING) * sum, i == j && i < FREEDOMS);
             }
             workgroupBarrier();
-            if lane == 0u {
+            if lane == 0u && iteration < STEPS {
                 move_posture();
             }
         }
-        if lane == 0u && possible {
-            bring_forth(FREEDOMS, links);
-            let cost = product(FREEDOMS, FREEDOMS);
-            if cost < least {
-                least = cost;
-                for (var joint = 0u; joint < JOINTS; joint++) {
-                    best[joint] = joint_of(posture, links, joint);
-                }
+        let cost = rows[FREEDOMS][FREEDOMS];
+        if possible && cost < least {
+            least = cost;
+            if lane < JOINTS {
+                best[lane] = places[lane];
             }
         }
     }
+    workgroupBarrier();
     if lane == 0u {
         for (var block = 0u; 4u * block < 3u * JOINTS; block++) {
             var texel = vec4(0.0);
