@@ -52,7 +52,7 @@ pub struct Request {
     pub urdf: PathBuf,
     /// Where `package://NAME/` is, for packages that are not found upwards from the URDF.
     pub packages: Vec<(String, PathBuf)>,
-    /// Other bodies of the robot, which free cameras see as often: their [`Frames`] files and URDFs.
+    /// Other bodies of the robot, which free cameras see as often: their [`Frames`](crate::robot::Frames) files and URDFs.
     pub bodies: Vec<(PathBuf, PathBuf)>,
     /// The robot's name, for the header.
     pub robot: String,
