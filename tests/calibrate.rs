@@ -163,7 +163,8 @@ fn cameras_are_found_by_time() {
     let rtde = "timestamp actual_q_0 actual_q_1 actual_q_2 actual_q_3 actual_q_4 actual_q_5";
     bench.write("rtde.csv", &table(rtde, " "));
     for file in ["angles.csv", "rtde.csv"] {
-        let (stdout, stderr, code) = bench.calibrate(&["lines", "--angles", file, "--json"]);
+        let (stdout, stderr, code) =
+            bench.calibrate(&["lines", "--angles", file, "--moving", "--json"]);
         assert_eq!((code, stderr.as_str()), (0, ""));
         let reports: Vec<Value> = stdout
             .lines()
@@ -202,7 +203,7 @@ fn cameras_are_found_by_time() {
         .replace("\n11", "\n21");
     bench.write("late.csv", &late);
     let stderr = bench.refused(&["lines", "--angles", "late.csv"]);
-    assert!(stderr.contains("left: error: from 0 of 40 frames (1 without the robot, 39 without joint angles by time)"), "{stderr}");
+    assert!(stderr.contains("left: error: from 0 of 40 frames (1 without the robot, 39 without joint angles by time, 0 of a moving robot)"), "{stderr}");
     assert!(
         stderr.contains("expected at least 3 points, found 0"),
         "{stderr}"
@@ -272,6 +273,63 @@ fn frames_are_matched_by_file_name_and_by_order() {
 }
 
 #[test]
+fn a_camera_that_is_late_is_found_by_poses_in_which_the_robot_stands() {
+    let bench = Bench::new();
+    let place = camera_from_base(0.5);
+    // Two seconds in a pose, one on the way to the next.
+    let pose = |time: f64| {
+        let part = (time % 3.0 - 2.0).max(0.0);
+        let [from, to] = [0.0, 1.0].map(|next| angles(4.0 * ((time / 3.0).floor() + next)));
+        let between = |joint: usize| from[joint] + part * (to[joint] - from[joint]);
+        std::array::from_fn::<f64, 6, _>(between)
+    };
+    let mut rows = format!("time_s,{}\n", JOINTS.join(","));
+    for n in 0..6000 {
+        let time = 0.01 * f64::from(n);
+        let cells = std::iter::once(time).chain(pose(time));
+        let cells: Vec<String> = cells.map(|v| format!("{v:.6}")).collect();
+        rows += &(cells.join(",") + "\n");
+    }
+    bench.write("angles.csv", &rows);
+    let mut lines = String::new();
+    for n in 4..150 {
+        let taken = 0.4 * f64::from(n);
+        let line = json!({"schema": 1, "type": "result", "camera": "late", "acquired_s": taken + 0.6, "status": "found",
+            "frame": "camera_optical", "joints": bench.joints(place, &pose(taken))});
+        lines += &format!("{line}\n");
+    }
+    bench.write("lines", &lines);
+    let report = bench.json(&["lines", "--angles", "angles.csv"]);
+    let (metres, radians) = off(&report, place);
+    assert!(metres < 1e-4 && radians < 1e-4, "{metres} {radians}");
+    let count = |key: &str| report[key].as_u64().unwrap();
+    assert!(count("frames_used") > 40 && count("frames_moving") > 80);
+    assert!(count("poses") > 10);
+    // One that never stands tells nothing, and why is said.
+    let late = |line: &str| {
+        let mut line: Value = serde_json::from_str(line).unwrap();
+        if let Some(time) = line["acquired_s"].as_f64() {
+            line["acquired_s"] = json!(time + 0.6);
+        }
+        format!("{line}\n")
+    };
+    let moving: String = watched(&bench, "left", place).lines().map(late).collect();
+    bench.write("lines", &moving);
+    bench.write(
+        "angles.csv",
+        &table(&format!("time_s,{}", JOINTS.join(",")), ","),
+    );
+    let stderr = bench.refused(&["lines", "--angles", "angles.csv"]);
+    assert!(
+        stderr.contains("of a moving robot): let it stand still"),
+        "{stderr}"
+    );
+    // Negative control: taken all the same, it is somewhere else.
+    let report = bench.json(&["lines", "--angles", "angles.csv", "--moving"]);
+    assert!(off(&report, place).0 > 0.02, "{report}");
+}
+
+#[test]
 fn few_poses_are_told() {
     let bench = Bench::new();
     let all = watched(&bench, "left", camera_from_base(0.3));
@@ -280,7 +338,7 @@ fn few_poses_are_told() {
     bench.write("lines", &few.join("\n"));
     let header = format!("time_s,{}", JOINTS.join(","));
     bench.write("angles.csv", &table(&header, ","));
-    let (text, stderr, _) = bench.calibrate(&["lines", "--angles", "angles.csv"]);
+    let (text, stderr, _) = bench.calibrate(&["lines", "--angles", "angles.csv", "--moving"]);
     assert!(text.contains("fewer than 5 poses"), "{text}{stderr}");
 }
 
@@ -292,7 +350,7 @@ fn a_pose_is_told_in_the_forms_of_ros() {
     bench.write("angles.csv", &table(&header, ","));
     let run = |form: &[&str]| {
         let (stdout, stderr, code) =
-            bench.calibrate(&[&["lines", "--angles", "angles.csv"], form].concat());
+            bench.calibrate(&[&["lines", "--angles", "angles.csv", "--moving"], form].concat());
         assert_eq!((code, stderr.as_str()), (0, ""));
         stdout
     };
@@ -350,7 +408,7 @@ fn cameras_that_cannot_be_told_apart_are_refused() {
         "angles.csv",
         &table(&format!("time_s,{}", JOINTS.join(",")), ","),
     );
-    let angles = ["--angles", "angles.csv"];
+    let angles = ["--angles", "angles.csv", "--moving"];
     let stderr =
         bench.refused(&[&["left/locate.jsonl", "right/locate.jsonl"], &angles[..]].concat());
     assert!(
@@ -403,7 +461,7 @@ fn bad_input_is_told_with_file_and_line() {
         ),
     ] {
         bench.write("bad", &(good.clone() + lines));
-        let stderr = bench.refused(&["bad", "--angles", "angles.csv"]);
+        let stderr = bench.refused(&["bad", "--angles", "angles.csv", "--moving"]);
         assert!(stderr.contains(told), "{stderr}");
     }
     let rows: Vec<&str> = rows.lines().collect();

@@ -43,6 +43,17 @@ impl Match {
     }
 }
 
+/// The robot's pose in a frame.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Pose {
+    /// Its joint angles, radians.
+    At(Vec<f64>),
+    /// It moved, shortly before or then: which of its poses the frame shows depends on how late the camera is.
+    Moving,
+    /// Nothing says.
+    Unknown,
+}
+
 /// Poses of the robot.
 pub struct Angles {
     rows: Vec<Row>,
@@ -50,6 +61,10 @@ pub struct Angles {
 
 const TIMES: [&str; 5] = ["time_s", "acquired_s", "timestamp", "time", "t"];
 const FILES: [&str; 2] = ["file", "image"];
+/// A frame may show what was so long before its time: a camera exposes, encodes, sends and is decoded first.
+const LATENCY_S: f64 = 1.0;
+/// A joint that turns no more in that time, radians, stands still.
+const STILL_RAD: f64 = 0.01;
 
 impl Angles {
     /// Reads the angles of `robot`'s joints. A file whose first character is `{` is JSON Lines.
@@ -94,21 +109,21 @@ impl Angles {
         Ok(Match::Order)
     }
 
-    /// Each frame's angles; `None` where there are none.
-    pub fn of(&self, frames: &[Frame], by: Match, tolerance_s: f64) -> Vec<Option<Vec<f64>>> {
+    /// Each frame's pose. `moving`: by time also where the robot moved.
+    pub fn of(&self, frames: &[Frame], by: Match, tolerance_s: f64, moving: bool) -> Vec<Pose> {
+        let pose = |angles: Option<Vec<f64>>| angles.map_or(Pose::Unknown, Pose::At);
         match by {
-            Match::Order => self
-                .rows
-                .iter()
-                .map(|row| Some(row.angles.clone()))
-                .collect(),
+            Match::Order => {
+                let rows = self.rows.iter();
+                rows.map(|row| Pose::At(row.angles.clone())).collect()
+            }
             Match::File => {
                 let rows = self.rows.iter();
                 let rows: HashMap<_, _> = rows
                     .filter_map(|row| Some((name(row.file.as_deref()?)?, &row.angles)))
                     .collect();
                 let of = |frame: &Frame| rows.get(&name(frame.file.as_deref()?)?).copied().cloned();
-                frames.iter().map(of).collect()
+                frames.iter().map(|frame| pose(of(frame))).collect()
             }
             Match::Time => {
                 let mut rows: Vec<(f64, &[f64])> = self
@@ -117,8 +132,17 @@ impl Angles {
                     .filter_map(|row| Some((row.time_s?, row.angles.as_slice())))
                     .collect();
                 rows.sort_by(|a, b| a.0.total_cmp(&b.0));
-                let of = |frame: &Frame| at(&rows, frame.time_s?, tolerance_s);
-                frames.iter().map(of).collect()
+                let of = |frame: &Frame| {
+                    let time = frame.time_s?;
+                    let angles = at(&rows, time, tolerance_s)?;
+                    Some(if moving || is_still(&rows, time, &angles) {
+                        Pose::At(angles)
+                    } else {
+                        Pose::Moving
+                    })
+                };
+                let frames = frames.iter();
+                frames.map(|f| of(f).unwrap_or(Pose::Unknown)).collect()
             }
         }
     }
@@ -142,11 +166,24 @@ fn at(rows: &[(f64, &[f64])], time: f64, tolerance: f64) -> Option<Vec<f64>> {
         return None;
     }
     let part = (time - last) / (next - last);
-    let between = |(from, to): (&f64, &f64)| {
-        let turn = (to - from + PI).rem_euclid(TAU) - PI;
-        from + part * turn
-    };
+    let between = |(&from, &to): (&f64, &f64)| from + part * turn(from, to);
     Some(from.iter().zip(to).map(between).collect())
+}
+
+/// From one angle to another the short way, radians.
+fn turn(from: f64, to: f64) -> f64 {
+    (to - from + PI).rem_euclid(TAU) - PI
+}
+
+/// Whether the robot was at `angles` all the time before `time` in which the frame may have been taken.
+fn is_still(rows: &[(f64, &[f64])], time: f64, angles: &[f64]) -> bool {
+    let first = rows.partition_point(|(then, _)| *then < time - LATENCY_S);
+    let before = rows.iter().skip(first);
+    let mut before = before.take_while(|(then, _)| *then <= time);
+    before.all(|(_, then)| {
+        let mut joints = then.iter().zip(angles);
+        joints.all(|(&then, &now)| turn(then, now).abs() <= STILL_RAD)
+    })
 }
 
 fn table(path: &Path, text: &str, robot: &Robot) -> anyhow::Result<Vec<Row>> {

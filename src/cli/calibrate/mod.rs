@@ -15,16 +15,17 @@ use glam::DVec3;
 use crate::calibration::{Pair, Registration, register};
 use crate::live::ros;
 use crate::robot::{Frames, Robot};
-use angles::Angles;
+use angles::{Angles, Pose};
 use frames::Frame;
 use report::{Report, Residual};
 
 /// Find where cameras are in the robot's base frame, by the joints that they see and the robot's joint angles
 ///
 /// The robot is the target: no markers, no rig. Takes the lines of `whereabot locate --json` or `whereabot watch`, of a
-/// camera that stood still while the robot moved. Prints each camera's pose with its uncertainty, and the arguments of
-/// ROS's static_transform_publisher. A frame gets its joint angles by its time (`acquired_s`, between the rows before
-/// and after), else by its image's file name, else, where there are as many rows as frames, by order. Exits with 0 if
+/// camera that stands still and a robot that stands in one pose after another. Prints each camera's pose with its
+/// uncertainty, and the arguments of ROS's static_transform_publisher. A frame gets its joint angles by its time
+/// (`acquired_s`, between the rows before and after; the robot stood still for the second before), else by its image's
+/// file name, else, where there are as many rows as frames, by order. Exits with 0 if
 /// all cameras were found; with 1 if one was not, or something could not be read; with 2 on wrong usage.
 #[derive(Debug, clap::Args)]
 pub struct Args {
@@ -44,6 +45,9 @@ pub struct Args {
     /// How far the rows of joint angles before and after a frame may be away, in seconds
     #[arg(long, value_name = "SECONDS", default_value_t = 0.05, value_parser = seconds)]
     tolerance: f64,
+    /// By time, use frames of a moving robot too: for cameras whose `acquired_s` is the exposure's time to the millisecond
+    #[arg(long)]
+    moving: bool,
     /// A line of JSON a camera
     #[arg(long)]
     json: bool,
@@ -88,7 +92,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut failed = false;
     let mut reports = Vec::new();
     for (camera, frames) in cameras {
-        match calibrate(&camera, &frames, &angles, &robot, args.tolerance) {
+        match calibrate(&camera, &frames, &angles, &robot, args) {
             Ok(report) => reports.push(report),
             Err(error) => {
                 failed = true;
@@ -130,7 +134,7 @@ fn calibrate(
     frames: &[Frame],
     angles: &Angles,
     robot: &Robot,
-    tolerance_s: f64,
+    args: &Args,
 ) -> anyhow::Result<Report> {
     let matched_by = angles.matches(frames)?;
     let index: HashMap<&str, usize> = robot
@@ -143,18 +147,23 @@ fn calibrate(
     let mut images: Vec<(Vec<DVec3>, Vec<DVec3>)> = Vec::new();
     // Which joint each of them is.
     let mut joints: Vec<usize> = Vec::new();
-    let (mut not_found, mut unmatched) = (0, 0);
-    for (frame, angles) in frames
-        .iter()
-        .zip(angles.of(frames, matched_by, tolerance_s))
-    {
+    let (mut not_found, mut unmatched, mut moving) = (0, 0, 0);
+    let poses = angles.of(frames, matched_by, args.tolerance, args.moving);
+    for (frame, pose) in frames.iter().zip(poses) {
         if frame.joints.is_empty() {
             not_found += 1;
             continue;
         }
-        let Some(angles) = angles else {
-            unmatched += 1;
-            continue;
+        let angles = match pose {
+            Pose::At(angles) => angles,
+            Pose::Moving => {
+                moving += 1;
+                continue;
+            }
+            Pose::Unknown => {
+                unmatched += 1;
+                continue;
+            }
         };
         let base = robot.joint_origins(&robot.link_poses(&angles));
         let (mut found, mut known) = (Vec::new(), Vec::new());
@@ -180,10 +189,15 @@ fn calibrate(
     let pairs = Pair::of_images(images.iter().map(|(found, known)| (&found[..], &known[..])));
     let found = register(&pairs).with_context(|| {
         let by = matched_by.name();
-        format!(
-            "from {used} of {} frames ({not_found} without the robot, {unmatched} without joint angles by {by})",
+        let mut text = format!(
+            "from {used} of {} frames ({not_found} without the robot, {unmatched} without joint angles by {by}, \
+             {moving} of a moving robot)",
             frames.len()
-        )
+        );
+        if moving > 0 {
+            text += ": let it stand still in each pose for more than a second, or see --moving";
+        }
+        text
     })?;
     Ok(Report {
         schema: 1,
@@ -201,6 +215,7 @@ fn calibrate(
         frames_used: used,
         frames_not_found: not_found,
         frames_unmatched: unmatched,
+        frames_moving: moving,
         poses: pairs.iter().map(|pair| pair.group + 1).max().unwrap_or(0),
         inlier_share: found.inlier_share(),
         residuals: residuals(robot, &pairs, &joints, &found),

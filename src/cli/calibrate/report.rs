@@ -32,6 +32,7 @@ pub struct Report {
     pub frames_used: usize,
     pub frames_not_found: usize,
     pub frames_unmatched: usize,
+    pub frames_moving: usize,
     pub poses: usize,
     pub inlier_share: f64,
     pub residuals: Vec<Residual>,
@@ -110,13 +111,14 @@ impl Report {
         let _ = writeln!(
             text,
             "  from {} of {} frames in {} poses of the robot, matched by {}; {} without the robot, {} without \
-             joint angles; {:.1} % of the joints agree",
+             joint angles, {} of a moving robot; {:.1} % of the joints agree",
             self.frames_used,
             self.frames,
             self.poses,
             self.matched_by.name(),
             self.frames_not_found,
             self.frames_unmatched,
+            self.frames_moving,
             100.0 * self.inlier_share
         );
         if self.poses < ENOUGH_POSES {
