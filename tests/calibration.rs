@@ -340,6 +340,45 @@ fn cameras_that_see_the_same_robot_find_each_other() {
 }
 
 #[test]
+fn a_robot_that_stands_says_the_same_again_and_again() {
+    let cameras = [0.0, 1.2].map(camera);
+    let truth = cameras[0].inverse() * cameras[1];
+    // Of 20 pairs of cameras: how far the second one is off in units of what is stated.
+    let run = |stands: bool| {
+        let mut noise = Noise(8);
+        let mut ratios: Vec<f64> = (0..20)
+            .map(|_| {
+                let biases: [Vec<DVec3>; 2] =
+                    std::array::from_fn(|_| (0..6).map(|_| 0.025 * noise.vector()).collect());
+                let mut rig = Rig::new(2, RigOptions::default());
+                for n in 0..40 {
+                    let time = 0.1 * f64::from(n);
+                    for (camera, &place) in cameras.iter().enumerate() {
+                        let pose = robot(if stands { 1.0 } else { 10.0 * time });
+                        let joint = |(&joint, &bias): (&DVec3, &DVec3)| {
+                            let bias = if stands { bias } else { 0.025 * noise.vector() };
+                            place.inverse().transform_point3(joint) + bias + 0.002 * noise.vector()
+                        };
+                        let joints = pose.iter().zip(&biases[camera]).map(joint);
+                        rig.observe(camera, time, &joints.collect::<Vec<_>>(), SPREAD);
+                    }
+                }
+                let pose = rig.pose(1).unwrap();
+                let at = pose.first_from_camera.translation;
+                at.distance(truth.translation) / pose.translation_sigma_m()
+            })
+            .collect();
+        ratios.sort_by(f64::total_cmp);
+        ratios[10]
+    };
+    let stands = run(true);
+    assert!(stands < 3.0, "{stands}");
+    // With the negative control: errors of their own each time average out, and what is stated says so.
+    let moves = run(false);
+    assert!((0.2..3.0).contains(&moves), "{moves}");
+}
+
+#[test]
 fn poses_go_by_way_of_cameras_between() {
     let cameras = [0.0, 1.2, 2.4].map(camera);
     let mut noise = Noise(4);

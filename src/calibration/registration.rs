@@ -37,6 +37,12 @@ impl Pair {
 /// make of them errs alike.
 const SAME_POSE_M: f64 = 0.05;
 
+/// Whether these are joints of one pose of the robot, in one frame.
+pub(super) fn is_same_pose(a: &[DVec3], b: &[DVec3]) -> bool {
+    let mut joints = a.iter().zip(b);
+    a.len() == b.len() && joints.all(|(a, b)| a.distance(*b) < SAME_POSE_M)
+}
+
 impl Pair {
     /// From a camera's frame to the robot's base frame. Of each image the joints in the camera's optical frame, as they
     /// were found, and the same joints in the base frame, by the robot's joint angles; metres. A group is a pose of the
@@ -47,10 +53,7 @@ impl Pair {
         let mut poses: Vec<&[DVec3]> = Vec::new();
         let mut pairs = Vec::new();
         for (found, base) in images {
-            let same = |pose: &&[DVec3]| {
-                let mut joints = pose.iter().zip(base);
-                pose.len() == base.len() && joints.all(|(a, b)| a.distance(*b) < SAME_POSE_M)
-            };
+            let same = |pose: &&[DVec3]| is_same_pose(pose, base);
             let group = poses.iter().position(same).unwrap_or(poses.len());
             if group == poses.len() {
                 poses.push(base);

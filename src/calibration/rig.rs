@@ -3,7 +3,7 @@ use std::collections::VecDeque;
 use glam::{DAffine3, DMat3, DVec3};
 
 use super::eigen::inverse;
-use super::registration::{P99_CHI_3, carried, jacobian, trace};
+use super::registration::{P99_CHI_3, carried, is_same_pose, jacobian, trace};
 use super::{Pair, Registration, register};
 
 /// How far a joint's estimate may be off: standard deviations, metres. Depth is what a single image tells least of.
@@ -155,12 +155,19 @@ struct Seen {
 /// Two cameras that saw the robot at the same time.
 #[derive(Debug, Clone, Default)]
 struct Link {
-    /// Times, and joints from the camera of the higher number to that of the lower.
-    instants: VecDeque<(f64, Vec<Pair>)>,
-    /// Instants so far.
-    count: usize,
+    instants: VecDeque<Instant>,
+    /// Poses of the robot so far.
+    poses: usize,
     /// When it was last found, and the way to the camera of the lower number and back.
     found: Option<(f64, Registration, Registration)>,
+}
+
+/// What two cameras saw at the same time.
+#[derive(Debug, Clone)]
+struct Instant {
+    time_s: f64,
+    /// From the camera of the higher number to that of the lower, in a group that is the robot's pose.
+    pairs: Vec<Pair>,
 }
 
 /// Cameras that see the same robot: where each is by the joints that two see at the same time, and where the joints are
@@ -270,8 +277,8 @@ impl Rig {
         }
         let link = self.links.get(place(to.min(from), to.max(from)))?;
         let (_, down, up) = link.found.as_ref()?;
-        let (last, _) = link.instants.back()?;
-        let remembered = self.newest() - last <= 3.0 * self.options.memory_s;
+        let last = link.instants.back()?;
+        let remembered = self.newest() - last.time_s <= 3.0 * self.options.memory_s;
         remembered.then_some(if to < from { down } else { up })
     }
 
@@ -319,6 +326,18 @@ fn place(low: usize, high: usize) -> usize {
 impl Link {
     fn add(&mut self, time_s: f64, low: &Seen, high: &Seen, options: &RigOptions) {
         let memory = options.memory_s;
+        // While both cameras and the robot stand, the networks err alike.
+        let same = |instant: &&Instant| {
+            let [from, to]: [Vec<DVec3>; 2] = [
+                instant.pairs.iter().map(|pair| pair.from).collect(),
+                instant.pairs.iter().map(|pair| pair.to).collect(),
+            ];
+            is_same_pose(&from, &high.joints) && is_same_pose(&to, &low.joints)
+        };
+        let kept = self.instants.iter().rfind(same);
+        let pose = kept.and_then(|kept| kept.pairs.first());
+        let group = pose.map_or(self.poses, |pair| pair.group);
+        self.poses = self.poses.max(group + 1);
         let joints = high.joints.iter().zip(&low.joints);
         let pairs = joints.map(|(&from, &to)| Pair {
             from,
@@ -326,12 +345,12 @@ impl Link {
             to,
             to_covariance: low.spread.covariance(to),
             weight: 1.0,
-            group: self.count,
+            group,
         });
-        self.instants.push_back((time_s, pairs.collect()));
-        self.count += 1;
-        while let Some((first, _)) = self.instants.front()
-            && time_s - first > 3.0 * memory
+        let pairs = pairs.collect();
+        self.instants.push_back(Instant { time_s, pairs });
+        while let Some(first) = self.instants.front()
+            && time_s - first.time_s > 3.0 * memory
         {
             self.instants.pop_front();
         }
@@ -347,9 +366,10 @@ impl Link {
         {
             return;
         }
-        let weighed = self.instants.iter().flat_map(|(then, pairs)| {
-            let weight = ((then - time_s) / memory).exp();
-            pairs.iter().map(move |&pair| Pair { weight, ..pair })
+        let weighed = self.instants.iter().flat_map(|instant| {
+            let weight = ((instant.time_s - time_s) / memory).exp();
+            let pairs = instant.pairs.iter();
+            pairs.map(move |&pair| Pair { weight, ..pair })
         });
         if let Ok(found) = register(&weighed.collect::<Vec<_>>()) {
             let back = found.inverse();
@@ -359,7 +379,7 @@ impl Link {
 
     /// Leaves out the instant that is closest to its neighbours, neither the oldest nor the newest.
     fn thin(&mut self) {
-        let times: Vec<f64> = self.instants.iter().map(|(time, _)| *time).collect();
+        let times: Vec<f64> = self.instants.iter().map(|i| i.time_s).collect();
         let gaps = times.windows(3).map(|w| w[2] - w[0]).enumerate();
         if let Some((before, _)) = gaps.min_by(|a, b| a.1.total_cmp(&b.1)) {
             self.instants.remove(before + 1);
