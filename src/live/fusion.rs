@@ -7,12 +7,12 @@ use super::{Event, Observation, Sink, Statistics};
 use crate::calibration::{CameraPose, FusedJoint, Rig, RigOptions, Smoother, Spread};
 use crate::cascade::Status;
 
-/// The robot's joints as all cameras together see them, after a frame of one of them.
+/// The robot's joints as all cameras together see them, after a frame of one of them that is of the newest instant.
 #[derive(Debug, Clone)]
 pub struct Fused {
     /// The rig's place in the configuration.
     pub rig: usize,
-    /// When the frame was taken, seconds since 1970 by the wall clock.
+    /// When the newest frame of any of the cameras was taken, seconds since 1970 by the wall clock.
     pub time_s: f64,
     /// The robot's joints, in the model's order and in the first camera's optical frame; smoothed where that is asked
     /// for.
@@ -29,6 +29,9 @@ pub struct Fusion<F> {
     /// Each camera's place in the rig, by its place in the configuration.
     places: Vec<Option<usize>>,
     rig: Rig,
+    simultaneous_s: f64,
+    /// When the newest frame was taken, seconds after the first one, and by the wall clock.
+    newest: Option<[f64; 2]>,
     /// When the first frame was taken. The wall clock may be set back, and would have the rig wait until it is where it was.
     started: Option<Instant>,
     smoother: Option<Smoother>,
@@ -60,6 +63,8 @@ impl<F: FnMut(Fused) + Send> Fusion<F> {
             number,
             places: (0..most).map(place).collect(),
             rig: Rig::new(cameras.len(), options),
+            simultaneous_s: options.simultaneous_s,
+            newest: None,
             started: None,
             smoother: smoothing_s.map(Smoother::new),
             fused,
@@ -89,10 +94,19 @@ impl<F: FnMut(Fused) + Send> Sink for Fusion<F> {
         let since = at.saturating_duration_since(started).as_secs_f64()
             - started.saturating_duration_since(at).as_secs_f64();
         self.rig.observe(place, since, &joints, Spread::at(middle));
+        let newest = self.newest.get_or_insert([since, time_s]);
+        if since > newest[0] {
+            *newest = [since, time_s];
+        }
+        let [newest, time_s] = *newest;
+        // Behind what was said already.
+        if newest - since > self.simultaneous_s {
+            return;
+        }
         let mut joints = self.rig.fused();
         if let Some(smoother) = &mut self.smoother {
             let points: Vec<DVec3> = joints.iter().map(|joint| joint.xyz_m).collect();
-            for (joint, smooth) in joints.iter_mut().zip(smoother.step(since, &points)) {
+            for (joint, smooth) in joints.iter_mut().zip(smoother.step(newest, &points)) {
                 joint.xyz_m = smooth;
             }
         }

@@ -14,6 +14,9 @@ pub struct Input {
     pub orientation: Orientation,
     /// The robot in view: its place among the engine's models.
     pub robot: usize,
+    /// The rig that it belongs to: frames of a rig's cameras are taken at the same moment, however few go into a
+    /// submission.
+    pub rig: Option<usize>,
 }
 
 impl fmt::Debug for Input {
@@ -22,6 +25,7 @@ impl fmt::Debug for Input {
             .field("calibration", &self.calibration)
             .field("orientation", &self.orientation)
             .field("robot", &self.robot)
+            .field("rig", &self.rig)
             .finish_non_exhaustive()
     }
 }

@@ -1,7 +1,7 @@
 use std::io::{self, Write};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, TrySendError, channel, sync_channel};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::mpsc::{Receiver, Sender, channel};
 use std::time::{Duration, SystemTime};
 
 use glam::DMat3;
@@ -14,12 +14,14 @@ use crate::cascade::EstimateLine;
 /// JSON Lines: a result a camera a frame, events, and a line of statistics a second. `docs/watch.md` lists the keys.
 ///
 /// A thread of its own writes them, each line with one write. Where whoever reads them is too slow, lines are lost,
-/// and the next line of statistics says how many.
+/// results first, and the next line of statistics says how many.
 #[derive(Debug)]
 pub struct Lines {
     cameras: Vec<Named>,
     rigs: Vec<NamedRig>,
-    lines: Option<SyncSender<String>>,
+    lines: Option<Sender<String>>,
+    /// How many lines wait to be written.
+    waiting: Arc<AtomicUsize>,
     /// Hangs up when all lines are written.
     written: Receiver<()>,
     lost: Arc<AtomicU64>,
@@ -138,6 +140,8 @@ struct CameraRates<'a> {
 impl Lines {
     /// Lines that wait to be written, at most.
     const QUEUE: usize = 1024;
+    /// Beyond those, lines of events and statistics that may wait: an event says what changed, and nothing says it again.
+    const RESERVE: usize = 1024;
     /// How long the last lines have to be written.
     const FAREWELL: Duration = Duration::from_millis(200);
 
@@ -147,12 +151,15 @@ impl Lines {
         mut output: impl Write + Send + 'static,
         closed: impl FnOnce(io::Error) + Send + 'static,
     ) -> Self {
-        let (lines, queue) = sync_channel::<String>(Self::QUEUE);
+        let (lines, queue) = channel::<String>();
+        let waiting: Arc<AtomicUsize> = Arc::default();
         let (writing, written) = channel();
+        let taken = Arc::clone(&waiting);
         std::thread::spawn(move || {
             // Hangs up at the end.
             let _writing = writing;
             for line in queue {
+                taken.fetch_sub(1, Ordering::Relaxed);
                 let done = output
                     .write_all(line.as_bytes())
                     .and_then(|()| output.flush());
@@ -166,6 +173,7 @@ impl Lines {
             cameras,
             rigs: Vec::new(),
             lines: Some(lines),
+            waiting,
             written,
             lost: Arc::default(),
         }
@@ -191,11 +199,19 @@ impl Lines {
         let Some(lines) = &self.lines else {
             return;
         };
+        let most = match line.content {
+            Content::Result { .. } | Content::Fused { .. } => Self::QUEUE,
+            Content::Event { .. } | Content::Statistics { .. } => Self::QUEUE + Self::RESERVE,
+        };
+        if self.waiting.load(Ordering::Relaxed) >= most {
+            self.lost.fetch_add(1, Ordering::Relaxed);
+            return;
+        }
         match serde_json::to_string(&line) {
             Ok(text) => {
-                if let Err(TrySendError::Full(_)) = lines.try_send(text + "\n") {
-                    self.lost.fetch_add(1, Ordering::Relaxed);
-                }
+                self.waiting.fetch_add(1, Ordering::Relaxed);
+                // Nobody listens any more once the output takes no more.
+                let _ = lines.send(text + "\n");
             }
             Err(error) => log::error!("a line cannot be written: {error}"),
         }

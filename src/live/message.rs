@@ -14,6 +14,8 @@ pub(super) enum Message {
         reason: String,
         retry_in: Duration,
     },
+    /// The engine does not take a camera's frames.
+    Refused { camera: usize, reason: String },
     /// A source came to its end.
     Ended { camera: usize },
     /// A frame was searched.

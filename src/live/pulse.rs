@@ -7,6 +7,8 @@ use super::Rates;
 #[derive(Debug, Default)]
 pub(super) struct Pulse {
     state: State,
+    /// Frames come, and the engine does not take them.
+    refused: bool,
     last: Option<Instant>,
     /// Between the last frames, the oldest first.
     intervals: VecDeque<Duration>,
@@ -45,7 +47,7 @@ impl Pulse {
             }
             _ => self.intervals.clear(),
         }
-        was != State::Live
+        was != State::Live && !self.refused
     }
 
     /// Between frames: what three of four intervals do not exceed, so that neither a pause nor a burst counts.
@@ -65,9 +67,16 @@ impl Pulse {
         self.state = State::Silent;
     }
 
-    /// A frame was answered.
-    pub fn answered(&mut self, age: Duration) {
+    /// The engine did not take a frame: the camera is not live before one is answered.
+    pub fn refused(&mut self) {
+        self.silenced();
+        self.refused = true;
+    }
+
+    /// A frame was answered: whether the camera is live from now on.
+    pub fn answered(&mut self, age: Duration) -> bool {
         self.ages.push(age);
+        std::mem::take(&mut self.refused) && self.state == State::Live
     }
 
     /// Until when the next frame must come; `None` where none is expected.

@@ -69,7 +69,7 @@ impl Reader {
                     // Before the frame itself: whoever sees its answer knows that the camera lives.
                     self.tell(Message::Arrived {
                         camera: self.camera,
-                        at: frame.acquired_at,
+                        at: Instant::now(),
                     });
                     self.mailboxes.put(frame);
                 }

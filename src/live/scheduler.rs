@@ -15,11 +15,12 @@ use crate::gpu::{Device, GpuError};
 
 /// Takes what is fresh from the mailboxes to the engine, and answers from it, in a thread of its own.
 ///
-/// The camera that waits longest is served first, so that too much work drops frames of all cameras alike.
+/// The camera that waits longest is served first, so that too much work drops frames of all cameras alike. Frames of a
+/// rig's cameras are taken together: some time apart they would say nothing of where the cameras are.
 pub(super) struct Scheduler {
     engine: Box<dyn Engine>,
-    /// Each camera's robot.
-    robots: Vec<usize>,
+    /// Each camera's robot and rig.
+    cameras: Vec<(usize, Option<usize>)>,
     /// The longest side that the engine takes now, in pixels, for the readers.
     max_side: Arc<AtomicU32>,
     mailboxes: Arc<Mailboxes>,
@@ -30,6 +31,8 @@ pub(super) struct Scheduler {
     /// Of each camera.
     trust: Vec<Trust>,
     round: u64,
+    /// Frames that were taken with others of their rig, and go next.
+    held: VecDeque<Frame>,
     under_way: VecDeque<Submission>,
     service: Service,
     /// Each camera's last answer, which nobody may have looked at yet.
@@ -66,7 +69,7 @@ impl Scheduler {
 
     pub fn new(
         engine: Box<dyn Engine>,
-        robots: Vec<usize>,
+        cameras: Vec<(usize, Option<usize>)>,
         max_side: Arc<AtomicU32>,
         mailboxes: Arc<Mailboxes>,
         messages: Sender<Message>,
@@ -74,11 +77,12 @@ impl Scheduler {
     ) -> Self {
         Self {
             engine,
-            served: vec![0; robots.len()],
-            answers: robots.iter().map(|_| Answer::default()).collect(),
-            trust: vec![Trust::Full; robots.len()],
-            fresh: Vec::with_capacity(robots.len()),
-            robots,
+            served: vec![0; cameras.len()],
+            answers: cameras.iter().map(|_| Answer::default()).collect(),
+            trust: vec![Trust::Full; cameras.len()],
+            fresh: Vec::with_capacity(cameras.len()),
+            held: VecDeque::with_capacity(cameras.len()),
+            cameras,
             max_side,
             mailboxes,
             messages,
@@ -126,7 +130,12 @@ impl Scheduler {
                 Self::POLL
             }
         };
-        match self.mailboxes.wait(wait) {
+        let mail = if self.held.is_empty() {
+            self.mailboxes.wait(wait)
+        } else {
+            Mail::Fresh
+        };
+        match mail {
             Mail::Fresh => self.submit()?,
             Mail::Closed if self.under_way.is_empty() => return Ok(false),
             Mail::Closed => std::thread::sleep(Self::POLL),
@@ -135,25 +144,31 @@ impl Scheduler {
         Ok(true)
     }
 
-    /// Submits frames of the robot whose camera waits longest.
-    fn submit(&mut self) -> Result<(), LocateError> {
+    /// Takes frames for a submission: of the robot whose camera waits longest. What its rig's cameras have besides is held.
+    fn take(&mut self) -> Vec<Frame> {
+        if let Some(frame) = self.held.pop_front() {
+            return vec![frame];
+        }
+        let (served, trust, cameras) = (&self.served, &self.trust, &self.cameras);
         self.mailboxes.fresh(&mut self.fresh);
-        let served = &self.served;
         self.fresh.sort_by_key(|&camera| served.get(camera));
         let Some(&oldest) = self.fresh.first() else {
-            return Ok(());
+            return Vec::new();
         };
-        let robot = |camera: usize| self.robots.get(camera).copied().unwrap_or_default();
-        let first = robot(oldest);
-        let trusted = |camera: usize| self.trust.get(camera) == Some(&Trust::Full);
+        let of = |camera: usize| cameras.get(camera).copied().unwrap_or_default();
+        let (robot, rig) = of(oldest);
+        let is_partner = |camera: usize| rig.is_some() && of(camera).1 == rig;
+        let trusted = |camera: usize| trust.get(camera) == Some(&Trust::Full);
         if trusted(oldest) {
             self.fresh
-                .retain(|&camera| robot(camera) == first && trusted(camera));
+                .retain(|&camera| of(camera).0 == robot && trusted(camera));
+            self.fresh.sort_by_key(|&camera| !is_partner(camera));
         } else {
             self.fresh.truncate(1);
         }
-        self.fresh
-            .truncate(self.engine.batch(first, self.fresh.len()));
+        let batch = self.engine.batch(robot, self.fresh.len());
+        let partners = self.fresh.iter().filter(|&&c| is_partner(c)).count();
+        self.fresh.truncate(batch.max(partners));
         self.round += 1;
         for &camera in &self.fresh {
             if let Some(served) = self.served.get_mut(camera) {
@@ -161,14 +176,25 @@ impl Scheduler {
             }
         }
         let frames = self.fresh.iter().filter_map(|&c| self.mailboxes.take(c));
-        let frames: Vec<Frame> = frames.collect();
+        let mut frames: Vec<Frame> = frames.collect();
+        self.held.extend(frames.drain(batch.min(frames.len())..));
+        frames
+    }
+
+    /// Submits the next frames.
+    fn submit(&mut self) -> Result<(), LocateError> {
+        let frames = self.take();
+        let camera = frames.first().and_then(|f| self.cameras.get(f.camera));
+        let Some(&(robot, _)) = camera else {
+            return Ok(());
+        };
         let begun = Instant::now();
         self.under_way.push_back(Submission {
             frames,
             submitted: begun,
         });
         if let Some(submission) = self.under_way.back_mut() {
-            match self.engine.submit(first, &submission.frames) {
+            match self.engine.submit(robot, &submission.frames) {
                 Ok(()) => {
                     submission.submitted = Instant::now();
                     self.service.submitted(submission.submitted - begun);
@@ -195,11 +221,9 @@ impl Scheduler {
             let now = if alone { Trust::Refused } else { Trust::Alone };
             let before = std::mem::replace(trust, now);
             if alone && before != Trust::Refused {
-                self.tell(Message::Failed {
+                self.tell(Message::Refused {
                     camera: frame.camera,
                     reason: error.to_string(),
-                    // With the next frame.
-                    retry_in: Duration::ZERO,
                 });
             }
         }
@@ -246,7 +270,8 @@ impl Scheduler {
 
     /// Opens the device again; what was under way is lost.
     fn recover(&mut self, reason: String) {
-        for frame in self.under_way.drain(..).flat_map(|s| s.frames) {
+        let under_way = self.under_way.drain(..).flat_map(|s| s.frames);
+        for frame in under_way.chain(self.held.drain(..)) {
             self.mailboxes.lose(frame.camera);
         }
         self.service = Service::default();

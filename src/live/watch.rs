@@ -27,11 +27,11 @@ pub fn watch(
     let mailboxes = Arc::new(Mailboxes::new(inputs.len()));
     let max_side = Arc::new(AtomicU32::new(engine.max_side()));
     let (sender, messages) = channel();
-    let robots = inputs.iter().map(|input| input.robot).collect();
+    let cameras = inputs.iter().map(|input| (input.robot, input.rig));
     let pulses = inputs.iter().map(|_| Pulse::default()).collect();
     let scheduler = Scheduler::new(
         engine,
-        robots,
+        cameras.collect(),
         Arc::clone(&max_side),
         Arc::clone(&mailboxes),
         sender.clone(),
@@ -157,6 +157,14 @@ impl Desk {
                 let retry_in = Some(retry_in);
                 self.event(Some(camera), EventKind::Failed { reason, retry_in });
             }
+            Message::Refused { camera, reason } => {
+                if let Some(pulse) = self.pulses.get_mut(camera) {
+                    pulse.refused();
+                }
+                // With the next frame.
+                let retry_in = Some(Duration::ZERO);
+                self.event(Some(camera), EventKind::Failed { reason, retry_in });
+            }
             Message::Ended { camera } => {
                 self.silence(camera);
                 self.event(Some(camera), EventKind::Ended);
@@ -166,8 +174,9 @@ impl Desk {
                 let Some(observation) = answer.take() else {
                     return;
                 };
-                if let Some(pulse) = self.pulses.get_mut(observation.camera) {
-                    pulse.answered(observation.age());
+                let pulse = self.pulses.get_mut(observation.camera);
+                if pulse.is_some_and(|pulse| pulse.answered(observation.age())) {
+                    self.event(Some(observation.camera), EventKind::Live);
                 }
                 for sink in &mut self.sinks {
                     sink.observation(&observation);

@@ -62,6 +62,39 @@ fn a_frame_that_is_cut_off_is_none() {
 }
 
 #[test]
+fn a_stream_that_is_decoded_too_slowly_is_late() {
+    // Each frame was taken three seconds after the last one by the stream's clock, and comes after a tenth of one: then
+    // every fourth of a second one of a hundredth.
+    let script =
+        "for time in 0 3 6 9; do frame 16 12; done; sleep 5; time=9.1; frame 16 12; sleep 30";
+    let (_folder, mut program) = start("rtsp://nowhere/x", Some(script));
+    let acquired = |line: &Value| line["acquired_s"].as_f64().unwrap();
+    program.wait_for("a late frame", |line| {
+        line["camera"] == "video" && line["age_ms"].as_f64().is_some_and(|age| age > 4000.0)
+    });
+    let late = program.seen.last().unwrap().clone();
+    let photo = program.wait_for_result("photos");
+    let before = acquired(&photo) - acquired(&late);
+    assert!(before > 4.0, "{before}");
+    // Negative control: the frames before came when they were taken.
+    let first = program
+        .seen
+        .iter()
+        .find(|line| line["camera"] == "video" && line["type"] == "result");
+    assert!(first.unwrap()["age_ms"].as_f64().unwrap() < 4000.0);
+
+    let script =
+        "for time in 0 3 6 9; do frame 16 12; done; sleep 0.3; time=-11; frame 16 12; sleep 30";
+    let (_folder, mut program) = start("rtsp://nowhere/x", Some(script));
+    let failed = program.wait_for_event("video", "failed");
+    assert!(
+        reason(&failed).contains("s late: they are not decoded"),
+        "{failed}"
+    );
+    program.wait_for_event("video", "live");
+}
+
+#[test]
 fn sizes_may_change_but_not_to_anything() {
     let script = "frame 16 12; sleep 0.2; frame 32 24; sleep 0.2; frame 99999 1 10; sleep 20";
     let (_folder, mut program) = start("http://nowhere/x", Some(script));

@@ -102,6 +102,38 @@ fn a_slow_reader_holds_nobody_up_and_learns_what_it_missed() {
 }
 
 #[test]
+fn results_that_nobody_reads_leave_room_for_what_changed() {
+    let (output, go, read) = slow();
+    let mut lines = lines(output).with_rigs(vec![NamedRig {
+        rig: "cell".into(),
+        cameras: vec![0],
+        joints: Vec::new(),
+    }]);
+    let fused = Fused {
+        rig: 0,
+        time_s: 1.0,
+        joints: Vec::new(),
+        poses: Vec::new(),
+    };
+    for _ in 0..3000 {
+        lines.fused(&fused);
+    }
+    for _ in 0..500 {
+        lines.event(&event());
+    }
+    lines.statistics(&statistics());
+    drop(go);
+    while read.lock().unwrap().len() < 100_000 {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    drop(lines);
+    let (lost, events) = account(&read.lock().unwrap());
+    assert_eq!(events, 500);
+    // Negative control: results were lost before.
+    assert!((1900..2000).contains(&lost), "{lost}");
+}
+
+#[test]
 fn a_reader_that_never_reads_does_not_keep_us() {
     let (output, _go, read) = slow();
     let mut lines = lines(output);

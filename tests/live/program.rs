@@ -27,8 +27,8 @@ pub fn folder(config: &str) -> tempfile::TempDir {
     folder
 }
 
-/// An `ffmpeg` that is this shell script. `frame WIDTH HEIGHT [BYTES]` announces a frame and writes its pixels, or
-/// only so many of them.
+/// An `ffmpeg` that is this shell script. `frame WIDTH HEIGHT [BYTES]` announces a frame, taken at $time, and writes its
+/// pixels, or only so many of them.
 pub fn fake_ffmpeg(folder: &Path, script: &str) -> PathBuf {
     let bin = folder.join("bin");
     std::fs::create_dir_all(&bin).unwrap();
@@ -36,7 +36,7 @@ pub fn fake_ffmpeg(folder: &Path, script: &str) -> PathBuf {
         "#!/bin/sh\n\
          [ \"$1\" = -version ] && exit 0\n\
          frame() {{\n\
-         echo \"[Parsed_showinfo_1 @ 0x1] [info] n: 0 pts: 0 fmt:rgba sar:1/1 s:$1x$2 i:P\" >&2\n\
+         echo \"[Parsed_showinfo_1 @ 0x1] [info] n: 0 pts: 0 pts_time:${{time:-NOPTS}} fmt:rgba sar:1/1 s:$1x$2 i:P\" >&2\n\
          head -c ${{3:-$(($1*$2*4))}} /dev/zero\n\
          }}\n\
          {script}\n"

@@ -1,7 +1,7 @@
 //! Newest frame wins, overload is shared, cameras do not wait for each other.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::simulated::{Collector, Simulated, StandIn, watch};
 use whereabot::camera::Camera;
@@ -192,10 +192,52 @@ fn frames_that_the_engine_refuses_are_their_camera_s_failure() {
     assert!(told[0].1.contains("no place for that"), "{told:?}");
     let dropped = collector.statistics().last().unwrap().cameras[1].dropped;
     assert!(dropped > 5, "{dropped}");
+    // Its frames come, but it is not live: nobody sees what it does.
+    let of_it = |collector: &Collector| {
+        let events = collector.events().into_iter();
+        let kinds = events.filter_map(|(camera, kind)| match kind {
+            EventKind::Live => Some((camera?, "live")),
+            EventKind::Failed { .. } => Some((camera?, "failed")),
+            _ => None,
+        });
+        let kinds = kinds.filter_map(|(camera, kind)| (camera == 1).then_some(kind));
+        kinds.collect::<Vec<_>>()
+    };
+    assert_eq!(of_it(&collector), ["live", "failed"]);
     // Negative control: nothing is refused.
     let collector = run(None);
+    assert_eq!(of_it(&collector), ["live"]);
     assert!(answers(&collector.observations(), 3)[1] > 0);
     assert_eq!(failures(&collector), []);
+}
+
+#[test]
+fn frames_of_a_rig_are_taken_together() {
+    let run = |rig| {
+        // One frame a submission, which takes as long as three frames come.
+        let cameras = (0..3).map(|camera| Input {
+            rig: Some(0).filter(|_| rig && camera != 1),
+            ..Simulated::new(40 * MS, 60).input()
+        });
+        let observations = run(cameras.collect(), StandIn::new(120 * MS, 1)).observations();
+        let all = answers(&observations, 3);
+        assert!(are_even(&all), "{all:?}");
+        let of = |camera| {
+            let of = observations.iter().filter(move |o| o.camera == camera);
+            of.map(|o| o.acquired_at).collect::<Vec<_>>()
+        };
+        let (first, other) = (of(0), of(2));
+        let together = first.iter().filter(|&&at| {
+            let apart = |&then: &Instant| at.max(then) - at.min(then) < 50 * MS;
+            other.iter().any(apart)
+        });
+        (together.count(), first.len())
+    };
+    let (together, all) = run(true);
+    assert!(all >= 4 && together + 1 >= all, "{together} of {all}");
+    // Negative control: without a rig each is taken when its turn comes.
+    let (together, all) = run(false);
+    assert!(2 * together < all, "{together} of {all}");
 }
 
 #[test]

@@ -65,6 +65,7 @@ impl Simulated {
             calibration: Calibration::Hfov(1.2),
             orientation: Orientation::NoTransforms,
             robot: 0,
+            rig: None,
         }
     }
 }

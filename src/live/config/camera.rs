@@ -27,6 +27,8 @@ pub struct CameraConfig {
     pub repeat: bool,
     /// Where it is in the common frame, where that is known.
     pub world_from_camera: Option<Pose>,
+    /// The place of the rig that it belongs to, of several the first.
+    pub rig: Option<usize>,
 }
 
 impl CameraConfig {
@@ -41,6 +43,7 @@ impl CameraConfig {
             fps: None,
             repeat: false,
             world_from_camera: None,
+            rig: None,
         }
     }
 
@@ -60,6 +63,7 @@ impl CameraConfig {
             calibration: self.calibration,
             orientation: self.orientation,
             robot: self.robot.place,
+            rig: self.rig,
         }
     }
 }
@@ -184,6 +188,7 @@ impl CameraTable {
             fps: self.fps.map(Spanned::into_inner),
             repeat,
             world_from_camera: self.world_from_camera,
+            rig: None,
         })
     }
 

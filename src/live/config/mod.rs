@@ -99,6 +99,11 @@ impl Config {
         let mut checked_rigs = Vec::with_capacity(rigs.len());
         for table in rigs {
             let rig = table.check(&document, &checked_rigs, &checked)?;
+            for &camera in &rig.cameras {
+                if let Some(camera) = checked.get_mut(camera) {
+                    camera.rig.get_or_insert(checked_rigs.len());
+                }
+            }
             checked_rigs.push(rig);
         }
         let warnings = warning::Config { rules, actions };

@@ -6,7 +6,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use super::showinfo::{Announced, Line, MAX_SIDE};
+use super::lateness::Lateness;
+use super::showinfo::{Line, MAX_SIDE};
 use super::{Shot, SourceError};
 use crate::live::Stop;
 
@@ -14,8 +15,18 @@ use crate::live::Stop;
 const STALLED: Duration = Duration::from_secs(10);
 /// The first one may take longer: some streams begin with the next key frame only.
 const OPENING: Duration = Duration::from_secs(30);
+/// A stream that is later than this is opened again, which skips what waits to be decoded.
+const LATE: Duration = Duration::from_secs(10);
 /// It is that many frames ahead of their pixels at most.
 const ANNOUNCED: usize = 64;
+
+/// A frame that ffmpeg's filter `showinfo` announced: its pixels are about to come.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Announced {
+    pub shot: Shot,
+    /// Columns and rows.
+    pub size: [u32; 2],
+}
 
 /// An `ffmpeg` that writes frames: killed when everything stops, when it writes none for too long, and when dropped.
 #[derive(Debug)]
@@ -50,15 +61,19 @@ struct State {
 enum Killed {
     Stopped,
     Stalled,
+    /// Its frames came so late.
+    Late(Duration),
     /// It announced what it should not.
     Refused,
 }
 
 impl Child {
-    /// Starts `command`, with its pixels. `secret` is left out of its errors.
+    /// Starts `command`, with its pixels. `secret` is left out of its errors. Frames of what is `live` come as they are
+    /// taken, or late.
     pub fn start(
         mut command: Command,
         secret: Option<String>,
+        live: bool,
         stop: &Arc<Stop>,
     ) -> Result<(Self, ChildStdout), SourceError> {
         command
@@ -91,7 +106,7 @@ impl Child {
         };
         let reader = Arc::clone(&shared);
         child.threads.push(std::thread::spawn(move || {
-            reader.read_log(log, secret.as_deref(), &sender);
+            reader.read_log(log, secret.as_deref(), live, &sender);
         }));
         let stop = Arc::clone(stop);
         child
@@ -128,6 +143,7 @@ impl Child {
         match (state.killed, &status) {
             (Some(Killed::Stopped), _) => return Ok(()),
             (Some(Killed::Stalled), _) => return Err(SourceError::Stalled(state.due.1)),
+            (Some(Killed::Late(by)), _) => return Err(SourceError::Late(by)),
             (None, Ok(status)) if status.success() => return Ok(()),
             _ => {}
         }
@@ -191,7 +207,14 @@ impl Shared {
     }
 
     /// Until its log ends.
-    fn read_log(&self, log: ChildStderr, secret: Option<&str>, frames: &SyncSender<Announced>) {
+    fn read_log(
+        &self,
+        log: ChildStderr,
+        secret: Option<&str>,
+        live: bool,
+        frames: &SyncSender<Announced>,
+    ) {
+        let mut lateness = Lateness::default();
         let mut log = BufReader::new(log);
         let mut bytes = Vec::new();
         loop {
@@ -202,14 +225,21 @@ impl Shared {
             }
             let text = String::from_utf8_lossy(&bytes);
             match Line::new(&text) {
-                Line::Frame([width, height]) => {
-                    let size = [width, height];
+                Line::Frame { size, time_s } => {
                     if size.iter().any(|side| !(1..=MAX_SIDE).contains(side)) {
                         self.state().oversized = Some(size);
                         self.kill(Killed::Refused);
                         return;
                     }
                     let shot = Shot::now();
+                    let late = match time_s {
+                        Some(time_s) if live => lateness.of(shot.acquired_at, time_s),
+                        _ => Duration::ZERO,
+                    };
+                    if late > LATE {
+                        return self.kill(Killed::Late(late));
+                    }
+                    let shot = shot.before(late);
                     if frames.send(Announced { shot, size }).is_err() {
                         return;
                     }

@@ -4,8 +4,7 @@ use std::sync::Arc;
 
 use image::RgbaImage;
 
-use super::child::Child;
-use super::showinfo::Announced;
+use super::child::{Announced, Child};
 use super::{Location, Shot, Source, SourceError, Stream};
 use crate::live::Stop;
 use crate::live::frame::resize;
@@ -96,11 +95,12 @@ impl Source for Ffmpeg {
             Location::Stream(address) => Some(address.clone()),
             _ => None,
         };
-        let (child, pixels) = Child::start(self.command(), secret, stop)?;
+        let ends = self.location.ends();
+        let (child, pixels) = Child::start(self.command(), secret, !ends, stop)?;
         Ok(Box::new(Frames {
             child,
             pixels,
-            ends: self.location.ends(),
+            ends,
         }))
     }
 }

@@ -1,3 +1,4 @@
+use std::fs::Metadata;
 use std::path::{Path, PathBuf};
 
 use super::ffmpeg::Ffmpeg;
@@ -31,14 +32,22 @@ impl Location {
     /// A path where there is nothing, or a folder without images; what was expected.
     pub fn new(text: &str, folder: &Path) -> Result<Self, String> {
         if let Ok(number) = text.parse::<u32>() {
-            return Self::device(&PathBuf::from(format!("/dev/video{number}")));
+            let path = PathBuf::from(format!("/dev/video{number}"));
+            return if path.exists() {
+                Ok(Self::Device(path))
+            } else {
+                Err(format!(
+                    "expected a webcam, found none at `{}`",
+                    path.display()
+                ))
+            };
         }
         if text.contains("://") {
             return Ok(Self::Stream(text.to_owned()));
         }
         let path = folder.join(text);
-        if path.starts_with("/dev") {
-            return Self::device(&path);
+        if std::fs::metadata(&path).is_ok_and(|found| is_device(&found)) {
+            return Ok(Self::Device(path));
         }
         if path.join("recording.json").is_file() {
             return Ok(Self::Recording(path));
@@ -55,17 +64,6 @@ impl Location {
              found none at `{}`",
             path.display()
         ))
-    }
-
-    fn device(path: &Path) -> Result<Self, String> {
-        if path.exists() {
-            Ok(Self::Device(path.to_owned()))
-        } else {
-            Err(format!(
-                "expected a webcam, found none at `{}`",
-                path.display()
-            ))
-        }
     }
 
     /// Whether it comes to an end: what is on a disk does, other sources are opened again.
@@ -108,4 +106,14 @@ impl Location {
             Ffmpeg::check()
         }
     }
+}
+
+#[cfg(unix)]
+fn is_device(found: &Metadata) -> bool {
+    std::os::unix::fs::FileTypeExt::is_char_device(&found.file_type())
+}
+
+#[cfg(not(unix))]
+fn is_device(_: &Metadata) -> bool {
+    false
 }

@@ -3,6 +3,7 @@
 mod child;
 mod ffmpeg;
 mod folder;
+mod lateness;
 mod location;
 mod pace;
 mod recording;
@@ -58,6 +59,18 @@ impl Shot {
             camera: None,
         }
     }
+
+    /// Of a frame that was taken so long before.
+    fn before(self, late: Duration) -> Self {
+        Self {
+            acquired: self.acquired.checked_sub(late).unwrap_or(self.acquired),
+            acquired_at: self
+                .acquired_at
+                .checked_sub(late)
+                .unwrap_or(self.acquired_at),
+            ..self
+        }
+    }
 }
 
 /// Why a source gives no frames.
@@ -90,4 +103,7 @@ pub enum SourceError {
     /// No frame came for so long.
     #[error("no frame for {0:?}")]
     Stalled(Duration),
+    /// Its frames came so late.
+    #[error("frames come {0:.1?} late: they are not decoded as fast as they are taken")]
+    Late(Duration),
 }
