@@ -857,6 +857,11 @@ fn the_shipped_weights_are_judged_on_the_gpu() {
         assert!((0.1..30.0).contains(&error), "{key}: {error}");
     }
     assert!(bench.path("plots/worst_masks_ur5.png").is_file());
+    assert_eq!(report["models"][0]["kinematic_fit"], true);
+    let unfitted = bench.json(&[&arguments[..], &["--no-fit"]].concat());
+    assert_eq!(unfitted["models"][0]["kinematic_fit"], false);
+    let same = |key: &str| unfitted["robots"][0][key] == figures[key];
+    assert!(same("mask") && same("presence") && !same("true_mask") && !same("estimated_mask"));
 
     let (table, _, code) = bench.evaluate(&[&arguments[..], &["--adapter", "cpu"]].concat());
     assert_eq!(code, 0);
@@ -866,6 +871,7 @@ fn the_shipped_weights_are_judged_on_the_gpu() {
         "the paper",
         "98.1 %",
         "wrist_3",
+        "ur5: moved to where an arm can have them",
     ] {
         assert!(table.contains(part), "{part}: {table}");
     }

@@ -182,9 +182,9 @@ impl Locator {
         Ok(Estimate::new(&self.description, frame, &view, output))
     }
 
-    /// Where the joint network puts the joints of the robot that `mask` shows in `image`: what it makes
-    /// of a better mask than the mask network's, or of a mask in which too little is sure. As it says
-    /// so, also where that cannot be: in the model's order, camera optical frame, metres.
+    /// Where the joint network, and the kinematic fit where the model has an arm, put the joints of the robot that
+    /// `mask` shows in `image`: what they make of a better mask than the mask network's, or of a mask in which too
+    /// little is sure. As they say so, also where that cannot be: in the model's order, camera optical frame, metres.
     ///
     /// # Errors
     /// As [`Locator::locate`], and a mask of another size than the model's.

@@ -26,7 +26,7 @@ pub struct Score {
 /// How far a model's joints are off in one image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct JointScore {
-    /// Behind the true mask: the joint network alone (paper, section 5, "separate").
+    /// Behind the true mask (paper, section 5, "separate"; there without a kinematic fit).
     pub true_mask: JointErrors,
     /// Behind the model's own mask (paper, section 5, "full system"), whether it found a robot or not.
     pub estimated_mask: JointErrors,

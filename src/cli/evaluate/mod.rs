@@ -58,6 +58,9 @@ pub struct Args {
     /// Draw into a folder that holds files, and overwrite those of the same name
     #[arg(long, requires = "plots")]
     force: bool,
+    /// Judge joints where the joint network puts them, not moved to where an arm can have them
+    #[arg(long)]
+    no_fit: bool,
     /// One JSON object instead of tables
     #[arg(long)]
     json: bool,
@@ -261,7 +264,10 @@ fn load(args: &Args) -> anyhow::Result<Vec<Judged>> {
     args.weights
         .iter()
         .map(|file| {
-            let model = Model::load(file)?;
+            let mut model = Model::load(file)?;
+            if args.no_fit {
+                model.description.arm = None;
+            }
             Ok(Judged {
                 file: file.clone(),
                 locator: engine::locator(&model, device.as_ref(), args.precision.into())?,
