@@ -11,6 +11,8 @@ pub mod draw;
 #[cfg(feature = "recording")]
 pub mod evaluation;
 pub mod gpu;
+#[cfg(feature = "recording")]
+mod image_file;
 #[cfg(feature = "live")]
 pub mod live;
 pub mod network;

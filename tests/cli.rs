@@ -651,8 +651,8 @@ fn a_folder_gives_its_images_in_order_and_not_our_own_pictures() {
     bench.image("photos/a.JPG", 32, 24, BLACK);
     bench.image("photos/below/c.png", 32, 24, BLACK);
     bench.write("photos/notes.txt", b"no image");
-    for _ in 0..2 {
-        let (lines, code) = bench.locate(&["photos", "--out", "photos"]);
+    for force in [&[][..], &["--force"]] {
+        let (lines, code) = bench.locate(&[&["photos", "--out", "photos"], force].concat());
         assert_eq!(code, 0);
         let files: Vec<_> = lines
             .iter()
@@ -660,7 +660,19 @@ fn a_folder_gives_its_images_in_order_and_not_our_own_pictures() {
             .collect();
         assert_eq!(files, ["photos/a.JPG", "photos/b.png"]);
     }
-    assert!(bench.path("photos/a.mask.png").is_file());
+    // Without being told to, nothing is overwritten: it may be somebody's.
+    bench.write("photos/a.mask.png", b"mine");
+    let (lines, code) = bench.locate(&["photos/a.JPG", "--out", "photos"]);
+    assert_eq!((&lines[0]["status"], code), (&"error".into(), 1));
+    let message = lines[0]["message"].as_str().unwrap();
+    assert!(
+        message.contains("a.mask.png is there already: --force"),
+        "{message}"
+    );
+    assert_eq!(
+        std::fs::read(bench.path("photos/a.mask.png")).unwrap(),
+        b"mine"
+    );
 }
 
 #[test]
@@ -780,7 +792,10 @@ fn a_reader_that_leaves_changes_no_verdict_and_no_file() {
         locate(&["white.png", "missing.png", "--out", "all"]),
         Some(1)
     );
-    assert_eq!(locate(&["white.png", "other.png", "--out", "all"]), Some(0));
+    assert_eq!(
+        locate(&["white.png", "other.png", "--out", "all", "--force"]),
+        Some(0)
+    );
     for name in ["white", "other"] {
         assert!(
             bench.path(&format!("all/{name}.mask.png")).exists(),

@@ -79,7 +79,8 @@ pub struct Registration {
     /// Of the rotation (a rotation vector in the frame to go to, radians: the true rotation is `exp(r)` times the
     /// transform's) and of the shift (metres), in this order.
     pub covariance: [[f64; 6]; 6],
-    /// How many times larger the residuals of the inliers are than their pairs' covariances say.
+    /// How many times larger the residuals of the inliers are than their pairs' covariances say: far above 1 where
+    /// the points of most pairs are not the same.
     pub scale: f64,
     /// Which pairs agree with the transform.
     pub inliers: Vec<bool>,

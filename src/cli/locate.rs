@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Instant;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 
@@ -31,7 +31,7 @@ pub struct Args {
     /// Images, and folders of images
     #[arg(required = true, value_name = "IMAGE|FOLDER")]
     inputs: Vec<PathBuf>,
-    /// The robot to find: its weights are looked for in the folder WHEREABOT_WEIGHTS, in ./weights, and from
+    /// The robot to find; which one an image shows is not told, and metres are wrong by another's weights. They are looked for in the folder WHEREABOT_WEIGHTS, in ./weights, and from
     /// the program's folder in weights, ../weights, ../../weights and ../share/whereabot/weights [default: ur5]
     #[arg(long, value_name = "NAME", value_parser = weights::robot_name)]
     robot: Option<String>,
@@ -47,6 +47,9 @@ pub struct Args {
     /// Write pictures into this folder: STEM.mask.png and STEM.annotated.png
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
+    /// Overwrite pictures that are there already
+    #[arg(long, requires = "out")]
+    force: bool,
     /// Find the mask only, no joints: faster
     #[arg(long)]
     mask_only: bool,
@@ -205,6 +208,24 @@ struct Pictures {
     annotated: PathBuf,
 }
 
+impl Pictures {
+    /// Pictures of an image, and whether they may be written.
+    fn new(out: &Path, stem: &str, force: bool) -> anyhow::Result<Self> {
+        let pictures = Self {
+            mask: out.join(format!("{stem}.mask.png")),
+            annotated: out.join(format!("{stem}.annotated.png")),
+        };
+        for file in [&pictures.mask, &pictures.annotated] {
+            ensure!(
+                force || !file.exists(),
+                "{} is there already: --force overwrites it",
+                file.display()
+            );
+        }
+        Ok(pictures)
+    }
+}
+
 /// Milliseconds.
 #[derive(Debug, Clone, Copy, Serialize)]
 struct Times {
@@ -220,6 +241,11 @@ fn locate(
     path: &Path,
     stems: &mut HashSet<String>,
 ) -> anyhow::Result<Located> {
+    let pictures = args
+        .out
+        .as_deref()
+        .map(|out| Pictures::new(out, &unused_stem(path, stems), args.force))
+        .transpose()?;
     let clock = Instant::now();
     let photo = photo::read(path)?;
     let decode = milliseconds(clock);
@@ -234,14 +260,9 @@ fn locate(
     let located = milliseconds(clock);
 
     let clock = Instant::now();
-    let pictures = args
-        .out
-        .as_deref()
-        .map(|out| {
-            let stem = unused_stem(path, stems);
-            draw_pictures(args, &engine.model, &photo, &camera, &estimate, out, &stem)
-        })
-        .transpose()?;
+    if let Some(pictures) = &pictures {
+        draw_pictures(args, &engine.model, &photo, &camera, &estimate, pictures)?;
+    }
     Ok(Located {
         file: path.display().to_string(),
         robot: engine.model.description.robot.clone(),
@@ -310,9 +331,8 @@ fn draw_pictures(
     photo: &Photo,
     camera: &Camera,
     estimate: &Estimate,
-    out: &Path,
-    stem: &str,
-) -> anyhow::Result<Pictures> {
+    pictures: &Pictures,
+) -> anyhow::Result<()> {
     let description = &model.description;
     let mask = estimate
         .mask
@@ -329,17 +349,13 @@ fn draw_pictures(
         hard
     };
 
-    let pictures = Pictures {
-        mask: out.join(format!("{stem}.mask.png")),
-        annotated: out.join(format!("{stem}.annotated.png")),
-    };
     let named = |path: &Path| format!("{}: cannot be written", path.display());
     mask.save(&pictures.mask)
         .with_context(|| named(&pictures.mask))?;
     annotated
         .save(&pictures.annotated)
         .with_context(|| named(&pictures.annotated))?;
-    Ok(pictures)
+    Ok(())
 }
 
 /// The version of the JSON lines.
@@ -413,13 +429,19 @@ impl Located {
     /// For people.
     fn summary(&self) -> String {
         let estimate = &self.estimate;
-        let found = match estimate.status {
-            Status::Found => format!("{} found", self.robot),
-            Status::NotFound => format!("{} not found", self.robot),
-            Status::Invalid => format!("{} seen, but its joints make no sense", self.robot),
+        let (found, looks) = match estimate.status {
+            Status::Found => (format!("{} found", self.robot), "is robot"),
+            Status::NotFound => (
+                format!("{} not found", self.robot),
+                "looks like it, too little of it surely",
+            ),
+            Status::Invalid => (
+                format!("{} seen, but its joints make no sense", self.robot),
+                "is robot",
+            ),
         };
         let mut text = format!(
-            "{}: {found}; {:.1} % of the image is robot, {:.0} % was seen ({:.0} ms on {})",
+            "{}: {found}; {:.1} % of the image {looks}, {:.0} % was seen ({:.0} ms on {})",
             self.file,
             100.0 * estimate.coverage,
             100.0 * estimate.field,

@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
 use exif::{In, Tag};
-use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits, RgbaImage};
+use image::{DynamicImage, ImageDecoder, ImageReader, Limits, RgbaImage};
+
+use crate::image_file;
 
 /// An image as a person sees it, and what its file says about the camera.
 pub struct Photo {
@@ -55,10 +57,7 @@ pub fn read(path: &Path) -> anyhow::Result<Photo> {
         width > 0 && height > 0,
         "expected an image, found no pixels"
     );
-    ensure!(
-        format != ImageFormat::Jpeg || jpeg_is_complete(&bytes),
-        "the JPEG is truncated: its end is missing"
-    );
+    image_file::ensure_complete(format, &bytes).context("cannot be decoded")?;
 
     // Broken metadata is no reason to refuse a picture.
     let focal_35mm = decoder
@@ -77,23 +76,10 @@ pub fn read(path: &Path) -> anyhow::Result<Photo> {
     })
 }
 
-/// The images in a folder (not below it), in the order of their names. Pictures that this program
-/// wrote are left out.
+/// The images in a folder, one at least ([`image_file::in_folder`]).
 pub fn in_folder(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
-    let mut images = Vec::new();
-    for entry in std::fs::read_dir(folder).context("cannot be read")? {
-        let path = entry.context("cannot be read")?.path();
-        let known = ImageFormat::from_path(&path).is_ok_and(|format| format.reading_enabled());
-        let own = path
-            .file_name()
-            .map(|name| name.to_string_lossy())
-            .is_some_and(|name| name.ends_with(".mask.png") || name.ends_with(".annotated.png"));
-        if known && !own && !path.is_dir() {
-            images.push(path);
-        }
-    }
+    let images = image_file::in_folder(folder).context("cannot be read")?;
     ensure!(!images.is_empty(), "no images in this folder");
-    images.sort();
     Ok(images)
 }
 
@@ -106,33 +92,4 @@ fn focal_length_35mm(exif: Vec<u8>) -> Option<f64> {
         .get_uint(0)
         .filter(|&millimetres| millimetres > 0)
         .map(f64::from)
-}
-
-/// Whether a JPEG has its end marker, behind all its scans. The decoder fills what is missing of a
-/// truncated file with grey, and says nothing.
-fn jpeg_is_complete(bytes: &[u8]) -> bool {
-    const END: u8 = 0xd9;
-    let mut at = 2;
-    loop {
-        // Between segments, and in a scan's data, the next marker is FF and neither 0 nor FF.
-        let Some(found) = bytes.get(at..).and_then(|rest| {
-            rest.windows(2)
-                .position(|w| w[0] == 0xff && !matches!(w[1], 0 | 0xff))
-        }) else {
-            return false;
-        };
-        let marker = bytes.get(at + found + 1).copied();
-        at += found + 2;
-        match marker {
-            Some(END) => return true,
-            // Restarts and TEM stand alone.
-            Some(0x01 | 0xd0..=0xd8) => {}
-            _ => {
-                let Some(&[high, low]) = bytes.get(at..at + 2) else {
-                    return false;
-                };
-                at += usize::from(u16::from_be_bytes([high, low]));
-            }
-        }
-    }
 }

@@ -37,7 +37,7 @@ pub struct Args {
     #[arg(long, value_name = "DIR")]
     backgrounds: PathBuf,
     /// How many samples the recording shall have
-    #[arg(long, value_name = "N", required_unless_present = "paper")]
+    #[arg(long, value_name = "N", required_unless_present = "paper", value_parser = clap::value_parser!(u64).range(1..))]
     samples: Option<u64>,
     /// Seed of the random numbers: the same seed gives the same samples
     #[arg(long, value_name = "S")]

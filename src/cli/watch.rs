@@ -244,6 +244,10 @@ fn config(args: &Args, models: &mut Models) -> anyhow::Result<Config> {
     };
     let cameras = args.source.iter().zip(1..).map(|(source, number)| {
         let location = Location::new(source, Path::new("")).map_err(anyhow::Error::msg)?;
+        ensure!(
+            calibration == Calibration::Assumed || !matches!(location, Location::Recording(_)),
+            "{source}: expected neither --camera nor --hfov: a recording has its own"
+        );
         Ok(CameraConfig {
             calibration,
             ..CameraConfig::new(format!("camera_{number}"), location, robot)

@@ -8,6 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
 use super::{HEIGHT, RecorderError, WIDTH};
+use crate::image_file;
 
 /// A random view of one photo.
 #[derive(Debug, Clone)]
@@ -192,14 +193,9 @@ fn resample(photo: &RgbImage, step: f64, place: [f64; 2], mirrored: bool) -> Rgb
 }
 
 fn decode(path: &Path) -> Result<RgbImage, RecorderError> {
-    let picture = image::ImageReader::open(path)
-        .and_then(image::ImageReader::with_guessed_format)
-        .map_err(RecorderError::io(path))?
-        .decode();
-    Ok(picture
-        .map_err(|cause| RecorderError::Picture {
-            path: path.to_owned(),
-            cause,
-        })?
-        .into_rgb8())
+    let picture = image_file::read(path).map_err(|cause| RecorderError::Picture {
+        path: path.to_owned(),
+        cause,
+    })?;
+    Ok(picture.into_rgb8())
 }

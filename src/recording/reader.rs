@@ -1,9 +1,10 @@
 use std::path::{Component, Path, PathBuf};
 
-use image::{DynamicImage, GrayImage, ImageReader, RgbImage};
+use image::{DynamicImage, GrayImage, RgbImage};
 
 use super::RecordingError;
 use super::format::{FORMAT, FRAME, Header, Sample, SourceKind, VERSION};
+use crate::image_file;
 
 /// Reads a recording. What it hands out has been checked.
 #[derive(Debug)]
@@ -103,10 +104,7 @@ impl Reader {
     }
 
     fn picture(&self, sample: &Sample, name: &str) -> Result<DynamicImage, RecordingError> {
-        let picture = ImageReader::open(self.folder.join(name))
-            .and_then(ImageReader::with_guessed_format)
-            .map_err(image::ImageError::from)
-            .and_then(ImageReader::decode)
+        let picture = image_file::read(&self.folder.join(name))
             .map_err(|cause| self.fault(sample, name, &cause.to_string()))?;
         let (width, height) = (self.header.width, self.header.height);
         if (picture.width(), picture.height()) != (width, height) {

@@ -146,6 +146,21 @@ impl Angles {
             }
         }
     }
+
+    /// The first and the last time of the frames and of the rows, where no frame is between rows.
+    pub fn apart(&self, frames: &[Frame], by: Match) -> Option<[[f64; 2]; 2]> {
+        if by != Match::Time {
+            return None;
+        }
+        let span = |times: &mut dyn Iterator<Item = f64>| {
+            times.fold([f64::INFINITY, f64::NEG_INFINITY], |[first, last], time| {
+                [first.min(time), last.max(time)]
+            })
+        };
+        let lines = span(&mut frames.iter().filter_map(|frame| frame.time_s));
+        let rows = span(&mut self.rows.iter().filter_map(|row| row.time_s));
+        (lines[1] < rows[0] || rows[1] < lines[0]).then_some([lines, rows])
+    }
 }
 
 /// A file's name without its folders.

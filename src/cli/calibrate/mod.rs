@@ -17,7 +17,7 @@ use crate::live::ros;
 use crate::robot::{Frames, Robot};
 use angles::{Angles, Pose};
 use frames::Frame;
-use report::{Report, Residual};
+use report::{Doubt, Report, Residual};
 
 /// Find where cameras are in the robot's base frame, by the joints that they see and the robot's joint angles
 ///
@@ -99,6 +99,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 // Nobody is left to tell where stderr is gone too.
                 let _ = writeln!(io::stderr(), "{camera}: error: {error:#}");
             }
+        }
+    }
+    for report in &reports {
+        for doubt in &report.doubts {
+            log::warn!("{}: {doubt}", report.camera);
         }
     }
     let text = if reports.is_empty() {
@@ -186,6 +191,8 @@ fn calibrate(
         images.push((found, known));
     }
     let used = images.len();
+    let mut doubts = Vec::new();
+    doubts.extend(links(robot, &images, &joints));
     let pairs = Pair::of_images(images.iter().map(|(found, known)| (&found[..], &known[..])));
     let found = register(&pairs).with_context(|| {
         let by = matched_by.name();
@@ -197,8 +204,18 @@ fn calibrate(
         if moving > 0 {
             text += ": let it stand still in each pose for more than a second, or see --moving";
         }
+        if let Some([lines, angles]) = angles.apart(frames, matched_by) {
+            let span = |[first, last]: [f64; 2]| format!("{first:.1} to {last:.1} s");
+            text += &format!(
+                ": lines are of {}, angles of {}: not one clock",
+                span(lines),
+                span(angles)
+            );
+        }
         text
     })?;
+    let poses = pairs.iter().map(|pair| pair.group + 1).max().unwrap_or(0);
+    doubts.extend(Doubt::of(&found, poses));
     Ok(Report {
         schema: 1,
         camera: camera.to_owned(),
@@ -216,9 +233,38 @@ fn calibrate(
         frames_not_found: not_found,
         frames_unmatched: unmatched,
         frames_moving: moving,
-        poses: pairs.iter().map(|pair| pair.group + 1).max().unwrap_or(0),
+        poses,
         inlier_share: found.inlier_share(),
+        residual_scale: found.scale,
+        doubts,
         residuals: residuals(robot, &pairs, &joints, &found),
+    })
+}
+
+/// Whether a link is longer or shorter in the lines than in the URDF: theirs is another arm then.
+fn links(robot: &Robot, images: &[(Vec<DVec3>, Vec<DVec3>)], joints: &[usize]) -> Option<Doubt> {
+    /// Of shorter ones, errors are as long.
+    const LONG_M: f64 = 0.2;
+    /// Bodies of one arm differ by a hundredth.
+    const SHARE: f64 = 0.15;
+    let per_image = images.first()?.0.len();
+    let joint = |place: usize| robot.joints.get(*joints.get(place)?);
+    (1..per_image).find_map(|place| {
+        let lengths = images.iter().filter_map(|(found, known)| {
+            let length =
+                |points: &[DVec3]| Some(points.get(place)?.distance(*points.get(place - 1)?));
+            Some((length(found)?, length(known)?))
+        });
+        let mut lengths: Vec<(f64, f64)> = lengths.collect();
+        lengths.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let &(found_m, known_m) = lengths.get(lengths.len() / 2)?;
+        let differs = known_m >= LONG_M && (found_m / known_m - 1.0).abs() > SHARE;
+        differs.then_some(Doubt::Link {
+            from: joint(place - 1)?.name.clone(),
+            to: joint(place)?.name.clone(),
+            found_m,
+            known_m,
+        })
     })
 }
 

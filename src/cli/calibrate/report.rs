@@ -1,9 +1,9 @@
 //! What is said of a camera.
 
-use std::fmt::Write;
+use std::fmt::{self, Write};
 
 use glam::{DAffine3, DQuat, EulerRot};
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 use super::angles::Match;
 use crate::calibration::Registration;
@@ -11,6 +11,10 @@ use crate::live::ros;
 
 /// From fewer poses of the robot, what a pose's joints have in common is not told from where the camera is.
 const ENOUGH_POSES: usize = 5;
+/// Where frames and joint angles belong together, residuals are half of what the networks are taken to err, and nine in ten
+/// joints agree.
+const MOST_SCALE: f64 = 1.0;
+const LEAST_SHARE: f64 = 0.7;
 
 /// A camera's pose in the robot's base frame, and how sure it is.
 #[derive(Serialize)]
@@ -35,7 +39,75 @@ pub struct Report {
     pub frames_moving: usize,
     pub poses: usize,
     pub inlier_share: f64,
+    /// How many times larger residuals are than the networks' errors are taken to be.
+    pub residual_scale: f64,
+    pub doubts: Vec<Doubt>,
     pub residuals: Vec<Residual>,
+}
+
+/// Why a pose may not be what its deviation says.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Doubt {
+    /// From so many poses.
+    Poses(usize),
+    /// Residuals are so many times larger than the networks' errors.
+    Scale(f64),
+    /// Only so many of the joints agree.
+    Share(f64),
+    /// A link has another length in the lines than in the URDF.
+    Link {
+        from: String,
+        to: String,
+        found_m: f64,
+        known_m: f64,
+    },
+}
+
+impl Doubt {
+    /// What is to be doubted about a camera that was found by so many poses of the robot.
+    pub fn of(found: &Registration, poses: usize) -> Vec<Self> {
+        let share = found.inlier_share();
+        let doubts = [
+            (poses < ENOUGH_POSES, Self::Poses(poses)),
+            (found.scale > MOST_SCALE, Self::Scale(found.scale)),
+            (share < LEAST_SHARE, Self::Share(share)),
+        ];
+        let doubts = doubts.into_iter().filter(|(applies, _)| *applies);
+        doubts.map(|(_, doubt)| doubt).collect()
+    }
+}
+
+impl fmt::Display for Doubt {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let theirs = "do the joint angles and the URDF belong to these frames?";
+        match self {
+            Self::Poses(_) => write!(
+                f,
+                "fewer than {ENOUGH_POSES} poses: joints of a pose agree with each other however far they are off \
+                 together, and the deviations know nothing of that"
+            ),
+            Self::Scale(scale) => write!(
+                f,
+                "what is left of the joints is {scale:.1} times what the networks err: {theirs}"
+            ),
+            Self::Share(share) => write!(f, "{:.0} % of the joints agree: {theirs}", 100.0 * share),
+            Self::Link {
+                from,
+                to,
+                found_m,
+                known_m,
+            } => write!(
+                f,
+                "from {from} to {to} it is {found_m:.2} m in these lines, {known_m:.2} m in the URDF: is it that of this arm?"
+            ),
+        }
+    }
+}
+
+impl Serialize for Doubt {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
 }
 
 /// What is left of a joint.
@@ -121,13 +193,6 @@ impl Report {
             self.frames_moving,
             100.0 * self.inlier_share
         );
-        if self.poses < ENOUGH_POSES {
-            let _ = writeln!(
-                text,
-                "  fewer than {ENOUGH_POSES} poses: joints of a pose agree with each other however far they are off together, \
-                 and the deviations know nothing of that"
-            );
-        }
         let _ = writeln!(
             text,
             "  {:14} {:>7} {:>6} {:>9} {:>10}",

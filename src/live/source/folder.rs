@@ -1,10 +1,11 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader, Limits, RgbaImage};
+use image::RgbaImage;
 
 use super::pace::Pace;
 use super::{Shot, Source, SourceError, Stream};
+use crate::image_file;
 use crate::live::Stop;
 
 /// The images in a folder, in the order of their names.
@@ -46,10 +47,11 @@ impl Stream for Pictures {
             return Ok(None);
         }
         let shot = Shot::now();
-        *image = read(path).map_err(|cause| {
+        let read = image_file::read_upright(path).map_err(|cause| {
             let text = format!("{}: {cause}", path.display());
             SourceError::Frame(text)
         })?;
+        *image = read.into_rgba8();
         Ok(Some(shot))
     }
 }
@@ -57,30 +59,9 @@ impl Stream for Pictures {
 /// The images in a folder (not below it).
 pub(super) fn images(folder: &Path) -> Result<Vec<PathBuf>, SourceError> {
     let fault = |what: &str| SourceError::Folder(format!("{}: {what}", folder.display()));
-    let mut paths = Vec::new();
-    for entry in std::fs::read_dir(folder).map_err(|e| fault(&e.to_string()))? {
-        let path = entry.map_err(|e| fault(&e.to_string()))?.path();
-        let known = ImageFormat::from_path(&path).is_ok_and(|format| format.reading_enabled());
-        if known && !path.is_dir() {
-            paths.push(path);
-        }
-    }
+    let paths = image_file::in_folder(folder).map_err(|cause| fault(&cause.to_string()))?;
     if paths.is_empty() {
         return Err(fault("no images in this folder"));
     }
-    paths.sort();
     Ok(paths)
-}
-
-/// Upright: EXIF's orientation is applied.
-fn read(path: &Path) -> Result<RgbaImage, image::ImageError> {
-    let mut reader = ImageReader::open(path)?.with_guessed_format()?;
-    reader.limits(Limits::default());
-    let mut decoder = reader.into_decoder()?;
-    let orientation = decoder.orientation().ok();
-    let mut image = DynamicImage::from_decoder(decoder)?;
-    if let Some(orientation) = orientation {
-        image.apply_orientation(orientation);
-    }
-    Ok(image.into_rgba8())
 }
