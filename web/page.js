@@ -8,7 +8,8 @@ const JOINT_COLOURS = ['#e63946', '#ff961e', '#ffe13c', '#3c87ff', '#9b55e1', '#
 const LONGEST_SIDE = 2048;
 
 let engine;
-// What is searched: {picture, width, height, live, mirrored, stop}, picture an ImageBitmap or a <video>.
+// What is searched: {picture, width, height, live, mirrored, track, stop}, picture an ImageBitmap or a <video>, track a
+// camera's.
 let source;
 let report;
 
@@ -57,7 +58,7 @@ async function refresh() {
     while (source && (wanted || (source.live && !source.picture.paused))) {
       wanted = false;
       await inTurn(() => search(source));
-      if (source.live) await nextFrame(source.picture);
+      if (source?.live) await nextFrame(source.picture);
     }
   } catch (error) {
     complainOfEngine(error);
@@ -77,8 +78,10 @@ function nextFrame(video) {
 }
 
 async function search(from) {
+  // A camera may end before its turn comes.
+  if (!from || from.picture.readyState < HTMLMediaElement.HAVE_CURRENT_DATA) return;
+  if (from.live) followSize(from);
   const { picture, width, height } = from;
-  if (picture.readyState < HTMLMediaElement.HAVE_CURRENT_DATA) return;
   const slow = setTimeout(() => $('caption').classList.add('busy'), 300);
   if ($('picture').width !== width || $('picture').height !== height) {
     Object.assign($('picture'), { width, height });
@@ -91,6 +94,17 @@ async function search(from) {
     clearTimeout(slow);
     $('caption').classList.remove('busy');
   }
+}
+
+// A phone that is turned, and a video now and then, changes its pictures' size. What it sees along the longer side stays:
+// the lens is the same.
+function followSize(from) {
+  const { videoWidth: width, videoHeight: height } = from.picture;
+  if (from.width === width && from.height === height) return;
+  // The tangent of half the angle, along the longer side.
+  const half = Math.tan((Number($('hfov').value) * Math.PI) / 360) * (Math.max(from.width, from.height) / from.width);
+  setHfov((Math.atan((half * width) / Math.max(width, height)) * 360) / Math.PI);
+  Object.assign(from, { width, height });
 }
 
 // --- showing
@@ -178,6 +192,21 @@ function use(next, hfov = assumed_hfov(next.width, next.height)) {
   return refresh();
 }
 
+// Lets go of a camera that was unplugged: its last answer is not shown as one of now.
+function loseCamera(track) {
+  if (source?.track !== track) return;
+  drawJoints([]);
+  source.stop();
+  source = undefined;
+  $('status').textContent = 'No camera';
+  $('status').className = '';
+  for (const id of ['time', 'rate', 'coverage']) $(id).textContent = '–';
+  $('positions').hidden = true;
+  document.querySelector('.live').hidden = true;
+  $('caption').textContent = 'the camera has ended';
+  complain('The camera has ended: what is shown is its last picture.');
+}
+
 function setHfov(degrees) {
   $('hfov').value = degrees;
   $('degrees').textContent = `${Number($('hfov').value).toFixed(1)}°`;
@@ -224,7 +253,8 @@ async function useCamera(facingMode) {
   const [track] = stream.getVideoTracks();
   // Only the view is mirrored: in a mirror, a left-handed robot would be searched.
   const mirrored = track.getSettings().facingMode === 'user';
-  await useVideo({ srcObject: stream }, { camera: facingMode, mirrored }, () => track.stop());
+  track.onended = () => loseCamera(track);
+  await useVideo({ srcObject: stream }, { camera: facingMode, mirrored, track }, () => track.stop());
 }
 
 async function useSample() {

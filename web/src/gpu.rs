@@ -142,13 +142,30 @@ impl Gpu {
         Ok(serde_json::to_string_pretty(&report.await)?)
     }
 
-    /// Copies `picture` to a texture, which is made anew only for another size.
+    /// Copies `picture`, which must have the size that the answer is of, to a texture, which is made anew only for
+    /// another size.
     fn take(
         &mut self,
         picture: &JsValue,
         width: u32,
         height: u32,
     ) -> Result<wgpu::TextureView, JsError> {
+        let source = if let Some(video) = picture.dyn_ref::<HtmlVideoElement>() {
+            wgpu::ExternalImageSource::HTMLVideoElement(video.clone())
+        } else if let Some(bitmap) = picture.dyn_ref::<ImageBitmap>() {
+            wgpu::ExternalImageSource::ImageBitmap(bitmap.clone())
+        } else {
+            return Err(JsError::new("picture: expected a video or a bitmap"));
+        };
+        let found = (source.width(), source.height());
+        if found != (width, height) {
+            // A browser copies no more than there is, and wgpu panics where it refuses.
+            let why = format!(
+                "picture: expected {width} x {height} pixels, found {} x {}",
+                found.0, found.1
+            );
+            return Err(JsError::new(&why));
+        }
         let size = wgpu::Extent3d {
             width,
             height,
@@ -173,13 +190,6 @@ impl Gpu {
                 });
                 texture.create_view(&Default::default())
             });
-        let source = if let Some(video) = picture.dyn_ref::<HtmlVideoElement>() {
-            wgpu::ExternalImageSource::HTMLVideoElement(video.clone())
-        } else if let Some(bitmap) = picture.dyn_ref::<ImageBitmap>() {
-            wgpu::ExternalImageSource::ImageBitmap(bitmap.clone())
-        } else {
-            return Err(JsError::new("picture: expected a video or a bitmap"));
-        };
         self.device.queue().copy_external_image_to_texture(
             &wgpu::CopyExternalImageSourceInfo {
                 source,
