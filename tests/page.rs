@@ -5,6 +5,7 @@
 use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
 use image::{Rgba, RgbaImage};
@@ -119,7 +120,11 @@ fn code(status: &str) -> u16 {
 
 /// What has changed since `known`: the message, and its tiles' files.
 fn changes(address: SocketAddr, known: u64) -> (Value, Vec<[Vec<u8>; 2]>) {
-    let (status, _, body) = get(address, &format!("/changes?since={known}"), "localhost");
+    ask(address, &format!("since={known}"))
+}
+
+fn ask(address: SocketAddr, query: &str) -> (Value, Vec<[Vec<u8>; 2]>) {
+    let (status, _, body) = get(address, &format!("/changes?{query}"), "localhost");
     assert_eq!(code(&status), 200);
     let (length, rest) = body.split_at(4);
     let length = u32::from_le_bytes(length.try_into().unwrap()) as usize;
@@ -217,6 +222,10 @@ fn bad_requests_are_refused_and_good_ones_still_answered() {
         "?since=-1",
         "?since=1e3",
         "?since=99999999999999999999",
+        "?since=0&owed=",
+        "?since=0&owed=1,",
+        "?since=0&owed=-1",
+        "?owed=1&since=0",
     ] {
         let path = format!("/changes{query}");
         assert_eq!(status(address, &path, "localhost"), 400, "{path}");
@@ -502,6 +511,71 @@ fn the_newest_frame_wins_and_tiles_have_a_pace() {
         frames.len() > 2 && frames.len() as u128 <= most,
         "{frames:?}"
     );
+}
+
+#[test]
+fn an_answer_is_never_large_and_each_camera_has_its_turn() {
+    const CAMERAS: usize = 6;
+    let [camera, _] = cameras().try_into().unwrap();
+    let server = Server::bind("127.0.0.1:0", vec![camera; CAMERAS]).unwrap();
+    let address = address(&server);
+    let mut sink = server.sink();
+    // Noise hardly shrinks.
+    let mut random = 1_u32;
+    let noise = RgbaImage::from_fn(400, 300, |_, _| {
+        random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        let [.., grey] = random.to_le_bytes();
+        Rgba([grey, grey, grey, 255])
+    });
+    let noise = Arc::new(noise);
+    let ended = Arc::new(AtomicBool::new(false));
+    let stop = ended.clone();
+    let feeder = std::thread::spawn(move || {
+        for frame in 0.. {
+            if stop.load(Ordering::Relaxed) {
+                return;
+            }
+            for camera in 0..CAMERAS {
+                sink.observation(&Observation {
+                    image: noise.clone(),
+                    view: Camera::from_hfov(400, 300, 1.2),
+                    ..observation(camera, frame)
+                });
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    });
+    wait_for(address, 0, |message| message["tiles"] != json!([]));
+
+    // How often a client that is slower than the cameras sees each of them.
+    let seen = |asks_for_what_is_owed: bool| {
+        let mut seen = [0; CAMERAS];
+        let (mut known, mut owed) = (0, String::new());
+        for _ in 0..18 {
+            let (message, files) = ask(address, &format!("since={known}{owed}"));
+            let bytes: usize = files.as_flattened().iter().map(Vec::len).sum();
+            assert!(bytes <= 200_000 && files.len() < CAMERAS, "{bytes}");
+            for tile in message["tiles"].as_array().unwrap() {
+                seen[tile["camera"].as_u64().unwrap() as usize] += 1;
+            }
+            known = change(&message);
+            let left = message["owed"].as_array().unwrap().iter();
+            let left: Vec<_> = left.map(Value::to_string).collect();
+            if asks_for_what_is_owed && !left.is_empty() {
+                owed = format!("&owed={}", left.join(","));
+            }
+            std::thread::sleep(Duration::from_millis(200));
+        }
+        seen
+    };
+    let fair = seen(true);
+    let (least, most) = (fair.iter().min().unwrap(), fair.iter().max().unwrap());
+    assert!(*least > 0 && most - least <= 1, "{fair:?}");
+    // Negative control: who does not say what it is owed sees the first cameras alone.
+    let unfair = seen(false);
+    assert_eq!(unfair[CAMERAS - 1], 0, "{unfair:?}");
+    ended.store(true, Ordering::Relaxed);
+    feeder.join().unwrap();
 }
 
 #[test]

@@ -221,11 +221,16 @@ fn statistics(frame: u64) -> Statistics {
     }
 }
 
-/// Counts what a page asks for, the tones it makes, and what its security policy kept from it.
+/// Counts what a page asks for, how often for tiles that it is owed, the tones it makes, and what its security policy kept
+/// from it.
 const COUNTERS: &str = "{
-    window.counts = { asked: 0, tones: 0, violations: [] };
+    window.counts = { asked: 0, owed: 0, tones: 0, violations: [] };
     const { fetch } = window;
-    window.fetch = (...what) => { counts.asked++; return fetch(...what); };
+    window.fetch = (url, ...how) => {
+        counts.asked++;
+        counts.owed += url.includes('&owed=');
+        return fetch(url, ...how);
+    };
     const { start } = OscillatorNode.prototype;
     OscillatorNode.prototype.start = function (...when) { counts.tones++; return start.apply(this, when); };
     document.addEventListener('securitypolicyviolation', ({ blockedURI }) => counts.violations.push(blockedURI));
@@ -412,6 +417,69 @@ fn a_pause_stops_the_traffic_and_a_lost_program_is_never_clear() {
     assert_eq!(page.run("return document.title"), "UNKNOWN · whereabot");
     save_screenshot(&mut page, "watch-lost");
     check(&mut page);
+}
+
+#[test]
+fn a_slow_line_is_no_lost_one_and_shows_nothing_old_as_new() {
+    let program = Program::start([None; 4]);
+    let mut page = open(&program, 1440, 900, 1, "light");
+    page.call("Network.enable", json!({}));
+    let line = |page: &mut Page, bytes_per_s: i32| {
+        let line = json!({"offline": false, "latency": 0, "downloadThroughput": bytes_per_s, "uploadThroughput": -1});
+        page.call("Network.emulateNetworkConditions", line);
+    };
+    let look = "
+        window.looks = { lost: 0, unveiled: 0, oldest: 0, fresh: [0, 0, 0, 0] };
+        let before = [];
+        setInterval(() => {
+            const veils = Array.from(document.querySelectorAll('.veil'));
+            looks.lost += document.getElementById('connection').className === 'lost';
+            looks.unveiled += veils.some(({ hidden }) => hidden);
+            veils.forEach(({ innerText }, camera) => {
+                const age = parseInt(innerText);
+                if (isNaN(age)) return;
+                looks.oldest = Math.max(looks.oldest, age);
+                looks.fresh[camera] += age < before[camera];
+                before[camera] = age;
+            });
+        }, 100)";
+
+    // Control: on a fast line nothing is veiled.
+    page.wait_until("!document.querySelector('.veil:not([hidden])')");
+    // All four pictures take longer than the page waits for a sign of life.
+    line(&mut page, 16_000);
+    std::thread::sleep(Duration::from_secs(4));
+    page.run(look);
+    std::thread::sleep(Duration::from_secs(30));
+    let looks = page.run("return looks");
+    assert_eq!((&looks["lost"], &looks["unveiled"]), (&json!(0), &json!(0)));
+    assert!(looks["oldest"].as_u64().unwrap() < 20, "{looks}");
+    let is_fresh = |looks: &Value| {
+        let fresh = looks["fresh"].as_array().unwrap().iter();
+        fresh.map(|count| count.as_u64().unwrap()).min() > Some(1)
+    };
+    assert!(is_fresh(&looks), "{looks}");
+    let states = "Array.from(document.querySelectorAll('#alarms li'), (alarm) => alarm.className)";
+    let known = format!("{states}.join() === 'stop,warn,unknown,clear'");
+    assert_eq!(page.run(&format!("return {known}")), true);
+
+    // Where alarms would be too old, the page gives up; of the pictures none comes twice, and all in the end.
+    line(&mut page, 7_000);
+    page.wait_until("counts.owed > 1");
+    page.run("looks.fresh.fill(0)");
+    page.wait_until("Math.min(...looks.fresh) > 0");
+
+    // Silence is no slow line.
+    line(&mut page, 1);
+    page.run("looks.lost = 0");
+    page.wait_until("looks.lost > 10");
+    assert_eq!(
+        page.run(&format!("return {states}")),
+        json!(vec!["unknown"; 4])
+    );
+    line(&mut page, -1);
+    page.wait_until(&known);
+    page.wait_until("!document.querySelector('.veil:not([hidden])')");
 }
 
 #[test]

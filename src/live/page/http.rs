@@ -12,8 +12,10 @@ const MOST_HEADERS: usize = 64;
 const FIRST_REQUEST_LIMIT: Duration = Duration::from_secs(1);
 /// Within which a further one must have come, counted from the last answer.
 const REQUEST_LIMIT: Duration = Duration::from_secs(5);
-/// Within which a client must have taken an answer.
-const ANSWER_LIMIT: Duration = Duration::from_secs(5);
+/// Within which a client must have taken so much of an answer as [`PIECE`], or what is left of it.
+const PIECE_LIMIT: Duration = Duration::from_secs(5);
+/// In bytes: a slow line takes as many in that time, one that is as good as none does not.
+const PIECE: usize = 32 * 1024;
 
 const OK: &str = "200 OK";
 
@@ -171,18 +173,16 @@ impl Connection {
     }
 
     fn send(&mut self, answer: &Answer, again: bool, head: bool) -> io::Result<()> {
-        let until = Instant::now() + ANSWER_LIMIT;
-        self.write(answer.headers(again).as_bytes(), until)?;
+        let mut bytes = answer.headers(again).into_bytes();
         if !head {
-            for part in &answer.parts {
-                self.write(part, until)?;
-            }
+            bytes.extend(answer.parts.concat());
         }
-        Ok(())
+        bytes.chunks(PIECE).try_for_each(|piece| self.write(piece))
     }
 
     /// `write_all`, but a client that takes a byte now and then does not win time by it.
-    fn write(&mut self, mut bytes: &[u8], until: Instant) -> io::Result<()> {
+    fn write(&mut self, mut bytes: &[u8]) -> io::Result<()> {
+        let until = Instant::now() + PIECE_LIMIT;
         while !bytes.is_empty() {
             if Instant::now() >= until {
                 return Err(io::ErrorKind::TimedOut.into());
@@ -284,7 +284,50 @@ fn is_timeout(error: &io::Error) -> bool {
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests {
+    use std::net::TcpListener;
+    use std::sync::atomic::{AtomicBool, Ordering};
+
     use super::*;
+
+    /// What comes of sending a large answer to a client that takes at most so many bytes ten times a second, and how long
+    /// it took.
+    fn send_to_a_client_of(bytes: usize) -> (io::Result<()>, Duration) {
+        // More than the system's buffers hold.
+        let answer = Answer::new("text/plain", vec![vec![0; 48 << 20].into()]);
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let mut client = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+        let mut connection = Connection {
+            stream: listener.accept().unwrap().0,
+            buffer: Vec::new(),
+        };
+        let done = AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let mut buffer = vec![0; bytes];
+                while !done.load(Ordering::Relaxed) && client.read(&mut buffer).unwrap() > 0 {
+                    std::thread::sleep(Duration::from_millis(100));
+                }
+            });
+            let start = Instant::now();
+            let sent = connection.send(&answer, false, false);
+            let time = start.elapsed();
+            done.store(true, Ordering::Relaxed);
+            drop(connection);
+            (sent, time)
+        })
+    }
+
+    #[test]
+    fn a_slow_client_gets_all_and_one_that_takes_next_to_nothing_is_dropped() {
+        let hardly = std::thread::spawn(|| send_to_a_client_of(100));
+        let (sent, time) = send_to_a_client_of(400_000);
+        assert!(sent.is_ok(), "{sent:?} after {time:?}");
+        // A limit on the whole answer would have ended it.
+        assert!(time > PIECE_LIMIT, "{time:?}");
+        let (sent, time) = hardly.join().unwrap();
+        assert!(sent.is_err(), "after {time:?}");
+        assert!(time < 4 * PIECE_LIMIT, "{time:?}");
+    }
 
     fn refusal(text: &str) -> &'static str {
         parse(text.as_bytes()).unwrap_err().status

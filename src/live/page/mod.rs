@@ -250,12 +250,15 @@ impl Site {
         if path != "changes" {
             return Answer::refusal("404 Not Found", "there is no such thing here");
         }
-        match request.query.strip_prefix("since=").map(str::parse) {
-            Some(Ok(known)) => {
-                let parts = self.board.changes_since(known);
+        match known_and_owed(&request.query) {
+            Some((known, owed)) => {
+                let parts = self.board.changes_since(known, &owed);
                 Answer::new("application/octet-stream", parts)
             }
-            _ => Answer::refusal("400 Bad Request", "expected ?since=NUMBER"),
+            None => {
+                let why = "expected ?since=NUMBER or ?since=NUMBER&owed=CAMERA,CAMERA,...";
+                Answer::refusal("400 Bad Request", why)
+            }
         }
     }
 
@@ -279,6 +282,16 @@ impl Site {
         let right = given.as_bytes().ct_eq(token.as_bytes());
         bool::from(right).then_some(path)
     }
+}
+
+/// Of `since=NUMBER&owed=CAMERA,CAMERA,...`, the latter only if there are any.
+fn known_and_owed(query: &str) -> Option<(u64, Vec<usize>)> {
+    let query = query.strip_prefix("since=")?;
+    let Some((known, owed)) = query.split_once("&owed=") else {
+        return Some((query.parse().ok()?, Vec::new()));
+    };
+    let owed: Result<_, _> = owed.split(',').map(str::parse).collect();
+    Some((known.parse().ok()?, owed.ok()?))
 }
 
 /// Of `HOST:PORT` or `HOST`.

@@ -6,8 +6,10 @@ const JOINT_COLOURS = ['#e63946', '#ff961e', '#ffe13c', '#3c87ff', '#9b55e1', '#
 const CAMERA_COLOURS = ['#2fb67c', '#4b8df8', '#e08a1e', '#c65bd6', '#d94f5c', '#1fa7b8'];
 // At most so often, in milliseconds.
 const PERIOD = 80;
-// An answer comes within a second, if only to say that nothing is new.
+// An answer comes within a second, if only to say that nothing is new; a slow line brings it piece by piece.
 const PATIENCE = 4000;
+// For so long alarms are believed while the rest of an answer comes.
+const LONGEST_ANSWER = 10000;
 const OLD = 1000;
 const CONDITIONS = { waiting: 'waiting', live: 'live', stale: 'no frames', failed: 'failed', ended: 'ended' };
 const ALARM_WORDS = { clear: 'clear', warn: 'warning', stop: 'stop', unknown: 'unknown' };
@@ -22,12 +24,14 @@ const ALARM_ICONS = {
 
 let run;
 let change = 0;
+// The cameras whose tiles the program has and did not send yet, first whose turn is next.
+let owed = [];
 let cameras = [];
 let conditions = [];
 // What the program last said of alarms, and what is shown of them.
 let toldAlarms = [];
 let alarms = [];
-// Of each camera, its element and what was last seen: {article, tile, picture, tint, at}.
+// Of each camera, its element and what was last seen: {article, tile, picture, tint, acquired}.
 let views = [];
 // The camera whose joints are listed; `together` is whether all are shown in space.
 let chosen = 0;
@@ -55,39 +59,59 @@ async function follow() {
 let asking;
 async function ask() {
   asking = new AbortController();
-  const response = await fetch(`changes?since=${change}`, { signal: AbortSignal.any([asking.signal, AbortSignal.timeout(PATIENCE)]) });
-  if (!response.ok) throw new Error(await response.text());
-  const bytes = await response.arrayBuffer();
-  const length = new DataView(bytes).getUint32(0, true);
-  const message = JSON.parse(new TextDecoder().decode(new Uint8Array(bytes, 4, length)));
-  // The program was started again, perhaps with other cameras.
-  if (run !== undefined && run !== message.run) return location.reload();
-  run = message.run;
-  let start = 4 + length;
-  const file = (size, type) => {
-    const blob = new Blob([new Uint8Array(bytes, start, size)], { type });
-    start += size;
-    return size > 0 ? createImageBitmap(blob) : null;
+  let silence;
+  const hear = () => {
+    clearTimeout(silence);
+    silence = setTimeout(() => asking.abort(), PATIENCE);
   };
-  const pictures = message.tiles.map(({ picture_bytes, tint_bytes }) =>
-    [file(picture_bytes, 'image/jpeg'), file(tint_bytes, 'image/png')]);
-  await take(message, await Promise.all(pictures.map((files) => Promise.all(files))));
+  hear();
+  try {
+    const signal = AbortSignal.any([asking.signal, AbortSignal.timeout(LONGEST_ANSWER)]);
+    const response = await fetch(`changes?since=${change}${owed.length > 0 ? `&owed=${owed}` : ''}`, { signal });
+    // Ages are those of now, however long the rest takes.
+    const sent = performance.now();
+    if (!response.ok) throw new Error(await response.text());
+    const read = reader(response.body, hear);
+    const length = new DataView((await read(4)).buffer).getUint32(0, true);
+    const message = JSON.parse(new TextDecoder().decode(await read(length)));
+    // The program was started again, perhaps with other cameras.
+    if (run !== undefined && run !== message.run) return location.reload();
+    run = message.run;
+    take(message);
+    for (const tile of message.tiles) await takeTile(tile, sent, read);
+    if (message.tiles.length > 0) showSpace(false);
+  } finally {
+    clearTimeout(silence);
+  }
 }
 
-function take(message, pictures) {
+// Reads a stream by so many bytes, and calls `hear` whenever some come.
+function reader(stream, hear) {
+  const source = stream.getReader();
+  let rest = new Uint8Array();
+  return async (size) => {
+    while (rest.length < size) {
+      const { done, value } = await source.read();
+      if (done) throw new Error('the answer is not whole');
+      hear();
+      const longer = new Uint8Array(rest.length + value.length);
+      longer.set(rest);
+      longer.set(value, rest.length);
+      rest = longer;
+    }
+    const bytes = rest.slice(0, size);
+    rest = rest.subarray(size);
+    return bytes;
+  };
+}
+
+// Alarms do not wait for pictures. What does not come of these is asked for again.
+function take(message) {
   if (paused) return;
   change = message.change;
+  owed = [...message.tiles.map(({ camera }) => camera), ...message.owed];
   if (message.cameras) meet(message.cameras);
   conditions = message.conditions;
-  const now = performance.now();
-  message.tiles.forEach((tile, index) => {
-    const view = views[tile.camera];
-    view.picture?.close();
-    view.tint?.close();
-    [view.picture, view.tint] = pictures[index];
-    Object.assign(view, { tile, acquired: now - tile.old_ms });
-    draw(tile.camera);
-  });
   toldAlarms = message.alarms ?? toldAlarms;
   if (message.alarms || lost) showAlarms(toldAlarms);
   setLost(false);
@@ -95,7 +119,19 @@ function take(message, pictures) {
   message.events.forEach(showEvent);
   notice(message.gpu_lost ? 'The GPU failed: nothing is searched until a device is open again.' : null);
   showConditions();
-  if (message.tiles.length > 0) showSpace(false);
+}
+
+async function takeTile(tile, sent, read) {
+  const image = (bytes, type) => (bytes.length > 0 ? createImageBitmap(new Blob([bytes], { type })) : null);
+  const files = [await read(tile.picture_bytes), await read(tile.tint_bytes)];
+  const [picture, tint] = await Promise.all([image(files[0], 'image/jpeg'), image(files[1], 'image/png')]);
+  if (paused) return;
+  const view = views[tile.camera];
+  view.picture?.close();
+  view.tint?.close();
+  Object.assign(view, { tile, picture, tint, acquired: sent - tile.old_ms });
+  owed = owed.filter((camera) => camera !== tile.camera);
+  draw(tile.camera);
 }
 
 function meet(found) {

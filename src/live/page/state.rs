@@ -15,6 +15,8 @@ use crate::live::{Event, EventKind, Observation, Rates, Statistics};
 
 /// Between two pictures of a camera.
 const TILE_PERIOD: Duration = Duration::from_millis(100);
+/// Of an answer's tiles, in bytes, unless there is one alone: what is newer waits for them on a slow line.
+const MOST_TILE_BYTES: usize = 200_000;
 /// How long a client is kept waiting for something new.
 const LONGEST_WAIT: Duration = Duration::from_secs(1);
 /// For so long after a client asked, pictures are encoded for it.
@@ -99,6 +101,8 @@ struct Message<'a> {
     statistics: Option<Vec<RatesMessage>>,
     events: Vec<&'a EventMessage>,
     tiles: Vec<TileMessage>,
+    /// The cameras whose tiles there was no room for, first whose turn is next.
+    owed: Vec<usize>,
 }
 
 #[derive(Debug, Clone, Serialize)]
@@ -295,9 +299,10 @@ impl Board {
         }
     }
 
-    /// What has changed since change `known`, 0 for all; waits a second for it at most. Little-endian u32: the length of
-    /// a JSON object; the object; then for each of its `tiles` the files `picture` and `tint`.
-    pub fn changes_since(&self, known: u64) -> Vec<Arc<[u8]>> {
+    /// What has changed since change `known`, 0 for all, and the tiles of the cameras `owed` before other tiles; waits a
+    /// second for it at most. Little-endian u32: the length of a JSON object; the object; then for each of its `tiles` the
+    /// files `picture` and `tint`.
+    pub fn changes_since(&self, known: u64, owed: &[usize]) -> Vec<Arc<[u8]>> {
         let until = Instant::now() + LONGEST_WAIT;
         let mut state = self.lock();
         if !state.is_watched() {
@@ -307,12 +312,15 @@ impl Board {
         self.work.notify_one();
         // A number from the future is another run's.
         let known = if known > state.change { 0 } else { known };
-        while state.change == known && !state.closed && Instant::now() < until {
+        let nothing_for_it = |state: &State| {
+            state.change == known && owed.iter().all(|camera| state.painted(*camera).is_none())
+        };
+        while nothing_for_it(&state) && !state.closed && Instant::now() < until {
             let left = until.saturating_duration_since(Instant::now());
             state = wait(&self.news, state, left);
         }
         state.asked_at = Some(Instant::now());
-        let (message, tiles) = self.message(&state, known);
+        let (message, tiles) = self.message(&state, known, owed);
         drop(state);
         let mut parts = vec![message];
         for tile in tiles {
@@ -321,9 +329,8 @@ impl Board {
         parts
     }
 
-    fn message(&self, state: &State, known: u64) -> (Arc<[u8]>, Vec<Tile>) {
-        let painted = state.views.iter().filter_map(|view| view.painted.as_ref());
-        let painted: Vec<_> = painted.filter(|tile| tile.change > known).collect();
+    fn message(&self, state: &State, known: u64, owed: &[usize]) -> (Arc<[u8]>, Vec<Tile>) {
+        let (painted, owed) = state.tiles_for(known, owed);
         let alarms = || state.alarms.values().collect();
         let statistics = state.statistics.as_ref();
         let statistics = statistics.filter(|_| state.statistics_change > known);
@@ -338,6 +345,7 @@ impl Board {
             statistics: statistics.map(|all| all.cameras.iter().map(RatesMessage::new).collect()),
             events: events.map(|(_, event)| event).collect(),
             tiles: painted.iter().map(|tile| tile.message_now()).collect(),
+            owed,
         };
         // Strings, numbers and lists alone.
         let json = serde_json::to_vec(&message).unwrap_or_default();
@@ -370,6 +378,35 @@ impl State {
 
     fn is_watched(&self) -> bool {
         self.asked_at.is_some_and(|at| at.elapsed() < WATCHED)
+    }
+
+    fn painted(&self, camera: usize) -> Option<&Painted> {
+        self.views.get(camera)?.painted.as_ref()
+    }
+
+    /// The tiles to send to a client that is owed some and knows the others up to change `known`, those that it has waited
+    /// for longest first; and the cameras whose tiles it is still owed.
+    fn tiles_for(&self, known: u64, owed: &[usize]) -> (Vec<&Painted>, Vec<usize>) {
+        let is_new = |camera: &usize| self.painted(*camera).is_some_and(|at| at.change > known);
+        let new = (0..self.views.len()).filter(is_new);
+        let mut cameras = Vec::new();
+        for camera in owed.iter().copied().chain(new) {
+            if camera < self.views.len() && !cameras.contains(&camera) {
+                cameras.push(camera);
+            }
+        }
+        let (mut tiles, mut left, mut bytes) = (Vec::new(), Vec::new(), 0);
+        for camera in cameras {
+            match self.painted(camera) {
+                Some(painted) if bytes == 0 || bytes + painted.tile.bytes() <= MOST_TILE_BYTES => {
+                    bytes += painted.tile.bytes();
+                    tiles.push(painted);
+                }
+                // No room for it, or forgotten until it is painted anew.
+                _ => left.push(camera),
+            }
+        }
+        (tiles, left)
     }
 
     /// A picture from when somebody last watched is not shown if there is a newer one.
@@ -577,7 +614,7 @@ mod tests {
 
     /// The frames that a client that knows nothing gets.
     fn frames(board: &Board) -> Vec<Value> {
-        let parts = board.changes_since(0);
+        let parts = board.changes_since(0, &[]);
         let message: Value = serde_json::from_slice(&parts[0][4..]).unwrap();
         let tiles = message["tiles"].as_array().unwrap();
         tiles.iter().map(|tile| tile["frame"].clone()).collect()

@@ -61,6 +61,11 @@ impl Tile {
             tint: tint.into(),
         })
     }
+
+    /// How large its files are.
+    pub fn bytes(&self) -> usize {
+        self.picture.len() + self.tint.len()
+    }
 }
 
 /// Width and height with sides of at most `longest`.
