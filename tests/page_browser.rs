@@ -78,23 +78,7 @@ impl Program {
                 });
             }
             let mut warn = |rule: &str, camera, state, distance_m, why| {
-                let warning = Warning {
-                    rule: rule.to_owned(),
-                    state,
-                    before: None,
-                    acts_as: state,
-                    acted_as: None,
-                    distance_m,
-                    uncertainty_m: None,
-                    why,
-                    frame_number: None,
-                    latency_ms: None,
-                };
-                sink.event(&Event {
-                    at,
-                    camera,
-                    kind: EventKind::Warning(warning),
-                });
+                sink.event(&warning(rule, camera, state, distance_m, why));
             };
             warn("bench cell", Some(0), State::Clear, Some(1.04), None);
             warn("wearer", Some(2), State::Warn, Some(0.58), None);
@@ -131,6 +115,10 @@ impl Program {
             feeder: Some(feeder),
             ended,
         }
+    }
+
+    fn tell(&self, event: &Event) {
+        self.server.as_ref().unwrap().sink().event(event);
     }
 
     fn url(&self) -> String {
@@ -204,6 +192,31 @@ fn observed(camera: usize, name: &str, truth: &Value) -> Observation {
                 probability,
             }),
         },
+    }
+}
+
+fn warning(
+    rule: &str,
+    camera: Option<usize>,
+    state: State,
+    distance_m: Option<f64>,
+    why: Option<Why>,
+) -> Event {
+    Event {
+        at: SystemTime::now(),
+        camera,
+        kind: EventKind::Warning(Warning {
+            rule: rule.to_owned(),
+            state,
+            before: None,
+            acts_as: state,
+            acted_as: None,
+            distance_m,
+            uncertainty_m: None,
+            why,
+            frame_number: None,
+            latency_ms: None,
+        }),
     }
 }
 
@@ -416,6 +429,64 @@ fn a_pause_stops_the_traffic_and_a_lost_program_is_never_clear() {
     );
     assert_eq!(page.run("return document.title"), "UNKNOWN · whereabot");
     save_screenshot(&mut page, "watch-lost");
+    check(&mut page);
+}
+
+#[test]
+fn a_screen_reader_hears_what_is_new_and_nothing_twice() {
+    let program = Program::start([None; 4]);
+    let mut page = open(&program, 1440, 900, 1, "light");
+    // A screen reader says what is written into these, the last one apart: that is the control.
+    page.run(
+        "window.said = {};
+         for (const id of ['connected', 'notice', 'spoken', 'rate']) {
+             said[id] = [];
+             const element = document.getElementById(id);
+             const note = () => said[id].push(element.textContent);
+             new MutationObserver(note).observe(element, { childList: true, characterData: true, subtree: true });
+         }",
+    );
+    page.wait_until("said.rate.length > 2");
+    for id in ["connected", "notice", "spoken"] {
+        assert_eq!(page.run(&format!("return said.{id}")), json!([]), "{id}");
+    }
+    let status = "return Array.from(document.querySelectorAll('[role=status]'), ({ id }) => id)";
+    assert_eq!(page.run(status), json!(["connected"]));
+    // Who sees sees the rate in its place.
+    let shown = "return [connected.className, rate.hidden, rate.innerText]";
+    assert_eq!(
+        page.run(shown),
+        json!(["spoken", false, "4 cameras · 39/s"])
+    );
+
+    // Two rules stop, one after the other; the same again at another distance is nothing new.
+    for distance_m in [0.3, 0.2] {
+        let stop = warning("bench cell", Some(0), State::Stop, Some(distance_m), None);
+        program.tell(&stop);
+        let shown = format!("at {distance_m:.2} m");
+        let alarms = "document.getElementById('alarms').innerText";
+        page.wait_until(&format!("{alarms}.includes('{shown}')"));
+    }
+    let both = "stop: bench cell, stop: loading door";
+    assert_eq!(page.run("return said.spoken"), json!([both]));
+
+    program.tell(&Event {
+        at: SystemTime::now(),
+        camera: None,
+        kind: EventKind::DeviceLost {
+            reason: "gone".to_owned(),
+        },
+    });
+    page.wait_until("said.notice.length > 0");
+    page.run("counts.asked = said.rate.length = 0");
+    page.wait_until("counts.asked > 5 && said.rate.length > 1");
+    let notices = page.run("return said.notice");
+    assert_eq!(notices.as_array().unwrap().len(), 1, "{notices}");
+    assert!(
+        notices[0].as_str().unwrap().contains("GPU failed"),
+        "{notices}"
+    );
+    assert_eq!(page.run("return said.connected"), json!([]));
     check(&mut page);
 }
 

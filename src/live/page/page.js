@@ -236,7 +236,7 @@ function showRates(statistics) {
   });
   const all = statistics.reduce((sum, { answers_per_s }) => sum + answers_per_s, 0);
   const count = cameras.length === 1 ? '1 camera' : `${cameras.length} cameras`;
-  $('connection').dataset.rate = `${count} · ${rate(all)}/s`;
+  $('rate').textContent = `${count} · ${rate(all)}/s`;
   showConnection();
 }
 
@@ -282,7 +282,6 @@ $('which').addEventListener('change', ({ target: { value } }) => choose(value ==
 // --- alarms
 
 function showAlarms(next) {
-  const before = worst();
   alarms = [...next];
   // The worst first.
   alarms.sort((a, b) => ALARM_STATES.indexOf(b.state) - ALARM_STATES.indexOf(a.state));
@@ -303,9 +302,8 @@ function showAlarms(next) {
   });
   $('alarms').querySelector('ul').replaceChildren(...items);
   $('alarms').hidden = items.length === 0;
-  if (worst() !== before) {
-    $('spoken').textContent = alarms.filter(({ state }) => state === worst()).map(({ rule, state }) => `${ALARM_WORDS[state]}: ${rule}`).join(', ');
-  }
+  const theWorst = alarms.filter(({ state }) => state === worst());
+  say('spoken', theWorst.map(({ rule, state }) => `${ALARM_WORDS[state]}: ${rule}`).join(', '));
   showTitle();
 }
 
@@ -392,8 +390,13 @@ function showEvent({ at_ms, camera, kind, text }) {
 
 // --- whether anything comes
 
+// A screen reader says what is written, be it what was there before.
+function say(id, text) {
+  if ($(id).textContent !== text) $(id).textContent = text;
+}
+
 function notice(text) {
-  $('notice').textContent = text ?? '';
+  say('notice', text ?? '');
   $('notice').hidden = !text;
 }
 
@@ -406,7 +409,10 @@ function setLost(isLost) {
 }
 
 function showConnection() {
-  $('connection').textContent = paused ? 'paused' : lost ? 'no connection' : ($('connection').dataset.rate ?? 'connected');
+  say('connected', paused ? 'paused' : lost ? 'no connection' : 'connected');
+  // Rates are seen in place of the word: spoken every second, they would drown all else.
+  $('rate').hidden = paused || lost || !$('rate').textContent;
+  $('connected').className = $('rate').hidden ? '' : 'spoken';
   $('connection').className = paused ? '' : lost ? 'lost' : 'live';
 }
 
