@@ -24,8 +24,12 @@ fn open() -> Device {
 fn the_adapter_in_use_is_listed() {
     let request = AdapterRequest::new(None, None);
     let (adapters, choice) = list_adapters(&request).unwrap();
-    let chosen = &adapters[choice.unwrap().index];
-    assert_eq!(chosen.info.name, open().info().name);
+    let choice = choice.unwrap();
+    let chosen = &adapters[choice.index];
+    let opened = open();
+    assert_eq!(chosen.info.name, opened.info().name);
+    assert_eq!(chosen.info.backend, opened.info().backend);
+    assert_eq!(choice.index, opened.choice().unwrap().index);
     assert!(chosen.unusable.is_none());
 }
 

@@ -152,22 +152,18 @@ pub fn list_adapters(
 
 /// The adapter that `request` leads to.
 pub(super) async fn open(request: &AdapterRequest) -> Result<(wgpu::Adapter, Choice), GpuError> {
-    let backends = request.backends()?;
-    // Without a wish, GL is looked at only where there is nothing better: opening it is slow, and
+    // Without a wish, GL is looked at only where it may have something better: opening it is slow, and
     // noisy on a machine without a display.
-    if *request == AdapterRequest::default()
-        && let Ok(found) = open_among(Backends::PRIMARY, request).await
-    {
-        return Ok(found);
+    let (first, last) = if *request == AdapterRequest::default() {
+        (Backends::PRIMARY, Backends::SECONDARY)
+    } else {
+        (request.backends()?, Backends::empty())
+    };
+    let mut adapters = enumerate(first).await;
+    let settles = |report: AdapterReport| report.unusable.is_none() && outranks_gl(&report.info);
+    if !last.is_empty() && !adapters.iter().map(AdapterReport::of).any(settles) {
+        adapters.extend(enumerate(last).await);
     }
-    open_among(backends, request).await
-}
-
-async fn open_among(
-    backends: Backends,
-    request: &AdapterRequest,
-) -> Result<(wgpu::Adapter, Choice), GpuError> {
-    let mut adapters = enumerate(backends).await;
     let reports: Vec<_> = adapters.iter().map(AdapterReport::of).collect();
     let choice = choose(&reports, request)?;
     Ok((adapters.swap_remove(choice.index), choice))
@@ -252,8 +248,9 @@ pub fn driver(info: &AdapterInfo) -> String {
         .to_owned()
 }
 
-/// Real GPUs first, and native backends before GL.
-fn rank(info: &AdapterInfo) -> (u8, u8) {
+/// Real GPUs first, and of those native backends before GL, whatever kind of GPU they say they have: so GL need not be
+/// opened to know that it has nothing better.
+fn rank(info: &AdapterInfo) -> (bool, u8, u8) {
     let kind = match info.device_type {
         DeviceType::DiscreteGpu => 4,
         DeviceType::IntegratedGpu => 3,
@@ -266,7 +263,12 @@ fn rank(info: &AdapterInfo) -> (u8, u8) {
         Backend::BrowserWebGpu => 1,
         _ => 0,
     };
-    (kind, backend)
+    (kind > 0, backend, kind)
+}
+
+/// Whether an adapter is better than any that GL can have.
+fn outranks_gl(info: &AdapterInfo) -> bool {
+    rank(info) > rank(&AdapterInfo::new(DeviceType::DiscreteGpu, Backend::Gl))
 }
 
 fn as_reason(kind: DeviceType) -> &'static str {
@@ -320,6 +322,47 @@ mod tests {
     #[test]
     fn the_best_real_gpu_is_chosen_on_its_native_backend() {
         assert_eq!(chosen(&three(), &AdapterRequest::default()), Some(2));
+    }
+
+    const KINDS: [DeviceType; 5] = [
+        DeviceType::DiscreteGpu,
+        DeviceType::IntegratedGpu,
+        DeviceType::VirtualGpu,
+        DeviceType::Other,
+        DeviceType::Cpu,
+    ];
+
+    #[test]
+    fn whether_gl_is_looked_at_changes_nothing() {
+        let request = AdapterRequest::default();
+        let mut looked_at = 0;
+        for native in KINDS {
+            let native = report("native", native, Backend::Vulkan);
+            for gl in KINDS {
+                let gl = report("gl", gl, Backend::Gl);
+                let all = chosen(&[native.clone(), gl], &request);
+                if outranks_gl(&native.info) {
+                    assert_eq!(all, Some(0), "{:?}", native.info.device_type);
+                } else {
+                    looked_at += usize::from(all == Some(1));
+                }
+            }
+        }
+        // Negative control: where GL has a real GPU beside a CPU rasteriser, it does change something.
+        assert_eq!(looked_at, 4);
+    }
+
+    #[test]
+    fn a_cpu_rasteriser_gives_way_to_a_real_gpu_on_gl_and_to_nothing_else_there() {
+        let lavapipe = report("llvmpipe", DeviceType::Cpu, Backend::Vulkan);
+        assert!(!outranks_gl(&lavapipe.info));
+        for kind in KINDS {
+            let gl = report("gl", kind, Backend::Gl);
+            let expected = usize::from(kind != DeviceType::Cpu);
+            let reports = [lavapipe.clone(), gl];
+            let found = chosen(&reports, &AdapterRequest::default());
+            assert_eq!(found, Some(expected), "{kind:?}");
+        }
     }
 
     #[test]
