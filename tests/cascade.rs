@@ -364,3 +364,24 @@ fn a_batch_of_none_and_a_camera_twice_are_refused_in_words() {
     // Negative control: nothing was submitted, and two cameras are taken.
     assert!(locator.submit(&images([2, 1])).unwrap());
 }
+
+#[test]
+fn a_camera_that_cannot_be_one_is_refused_in_words() {
+    let model = constant(0.9, 2.0);
+    let mut locator = Locator::on_cpu(&model);
+    let image = picture(48, 40, 1);
+    let right = Camera::from_hfov(48, 40, 1.2);
+    for focal in [f64::NAN, f64::INFINITY, 0.0, -30.0] {
+        let mut camera = right;
+        camera.intrinsics.fy = focal;
+        let error = locator.locate(&image, &camera, ALL).unwrap_err();
+        assert!(matches!(error, LocateError::Camera(_)), "{error}");
+        let expected = format!("expected a positive focal length in pixels, found {focal}");
+        assert!(error.to_string().contains(&expected), "{error}");
+        // Negative control: the camera as it was.
+        locator.locate(&image, &right, ALL).unwrap();
+    }
+    let none = Camera::from_hfov(0, 0, 1.2);
+    let error = locator.locate(&RgbaImage::new(0, 0), &none, ALL);
+    assert!(matches!(error, Err(LocateError::Camera(_))), "{error:?}");
+}

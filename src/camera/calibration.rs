@@ -69,7 +69,7 @@ pub enum CameraError {
 
 impl Camera {
     /// A pinhole with square pixels, the principal point in the middle, and a horizontal field of
-    /// view of `hfov` radians.
+    /// view of `hfov` radians, in (0, pi).
     pub fn from_hfov(width: u32, height: u32, hfov: f64) -> Self {
         Self::centred(width, height, 0.5 * f64::from(width) / (0.5 * hfov).tan())
     }

@@ -125,7 +125,7 @@ impl BatchLocator {
     ///
     /// # Errors
     /// Another number of images, a camera that there is not, two images of one camera, an image of another size than its camera's or beyond
-    /// the adapter's limits; a device that was lost.
+    /// the adapter's limits, a camera that [`Camera::check`] refuses; a device that was lost.
     pub fn submit(&mut self, images: &[BatchImage<'_>]) -> Result<bool, LocateError> {
         self.device.check()?;
         let batch = self.plan.batch();

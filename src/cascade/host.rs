@@ -204,8 +204,8 @@ impl HostLocator {
     ///
     /// # Errors
     /// An index beyond the batch; a texture of another format, size or usage than what can be read; a camera
-    /// of another size than the image; a crop beyond it; too little memory for a mask texture of the new size. The
-    /// former source stays then.
+    /// of another size than the image, or that [`Camera::check`] refuses; a crop beyond it; too little memory for a mask
+    /// texture of the new size. The former source stays then.
     pub fn set_source(&mut self, index: usize, source: &Source) -> Result<(), LocateError> {
         self.device.check()?;
         let [width, height] = source.planes.size();

@@ -6,7 +6,7 @@ use super::Estimate;
 #[cfg(not(target_arch = "wasm32"))]
 use super::Mask;
 use super::view::View;
-use crate::camera::{Camera, Crop, Rectification, Texels};
+use crate::camera::{Camera, CameraError, Crop, Rectification, Texels};
 use crate::gpu::{Device, Frame, GpuError, Plan, Precision};
 use crate::network::{Description, Model};
 use crate::reference;
@@ -64,6 +64,9 @@ pub enum LocateError {
         /// Rows of the image.
         height: u32,
     },
+    /// The camera cannot be one.
+    #[error("camera: {0}")]
+    Camera(#[from] CameraError),
     /// A mask that is not of the model's size.
     #[error("mask: expected {expected} values, found {found}")]
     Mask {
@@ -145,8 +148,8 @@ impl Locator {
     /// Searches `image`, taken by `camera`. Its alpha is ignored.
     ///
     /// # Errors
-    /// An image of another size than the camera's, or beyond the adapter's limits; a GPU that
-    /// failed, was lost or does not answer.
+    /// An image of another size than the camera's, or beyond the adapter's limits; a camera that
+    /// [`Camera::check`] refuses; a GPU that failed, was lost or does not answer.
     #[cfg(not(target_arch = "wasm32"))]
     pub fn locate(
         &mut self,

@@ -48,6 +48,9 @@ impl View {
 
     /// What the networks of `description` see of an upright image of `size` by `camera`, whose pixels lie at `texels`:
     /// `last` where that is the same still.
+    ///
+    /// # Errors
+    /// A camera of another size than the image, or one that [`Camera::check`] refuses.
     pub fn of(
         last: Option<Self>,
         camera: &Camera,
@@ -64,16 +67,18 @@ impl View {
             });
         }
         let is_same = |last: &Self| last.camera == *camera && last.rectification.texels == texels;
+        if let Some(last) = last.filter(is_same) {
+            return Ok(last);
+        }
+        camera.check()?;
         let input = description.input;
-        Ok(last.filter(is_same).unwrap_or_else(|| {
-            Self::new(
-                camera,
-                texels,
-                &description.camera,
-                input.width,
-                input.height,
-            )
-        }))
+        Ok(Self::new(
+            camera,
+            texels,
+            &description.camera,
+            input.width,
+            input.height,
+        ))
     }
 
     /// Where the camera sees what the canonical camera sees at `pixel`; `None` where its lens shows
