@@ -6,7 +6,7 @@ use super::{GpuError, Tier};
 /// (the best real GPU).
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct AdapterRequest {
-    /// Index in [`list_adapters`], or a part of the adapter's name in any case.
+    /// Index in [`list_adapters`], or a part of the adapter's name in any case; a number that is no index, a whole word of it.
     pub adapter: Option<Wanted>,
     /// Backends to search; all when `None`.
     pub backends: Option<Wanted>,
@@ -204,7 +204,7 @@ fn choose(reports: &[AdapterReport], request: &AdapterRequest) -> Result<Choice,
     let reason = format!("{} = {}", wanted.origin, wanted.value);
     let name = wanted.value.to_lowercase();
     let by_index = name.parse().ok().filter(|&index| index < reports.len());
-    let is_named = |report: &AdapterReport| report.info.name.to_lowercase().contains(&name);
+    let is_named = |report: &AdapterReport| is_in(&report.info.name.to_lowercase(), &name);
     // A card has an adapter a backend, not each of which may be usable.
     let by_name = || {
         let usable = |report: &AdapterReport| is_named(report) && report.unusable.is_none();
@@ -228,6 +228,15 @@ fn choose(reports: &[AdapterReport], request: &AdapterRequest) -> Result<Choice,
         }),
         _ => Ok(Choice { index, reason }),
     }
+}
+
+/// Whether `wanted` is in `name`, both in lower case. Names are full of digits: a number must be a word of its own.
+fn is_in(name: &str, wanted: &str) -> bool {
+    if wanted.parse::<u64>().is_err() {
+        return name.contains(wanted);
+    }
+    let is_apart = |c: char| !(c.is_alphanumeric() || c == '.');
+    name.split(is_apart).any(|word| word == wanted)
 }
 
 /// What kind of device an adapter is, such as `discrete GPU`.
@@ -297,9 +306,11 @@ mod tests {
         }
     }
 
+    const LLVMPIPE: &str = "llvmpipe (LLVM 15.0.6, 256 bits)";
+
     fn three() -> Vec<AdapterReport> {
         vec![
-            report("llvmpipe", DeviceType::Cpu, Backend::Vulkan),
+            report(LLVMPIPE, DeviceType::Cpu, Backend::Vulkan),
             report("Card", DeviceType::DiscreteGpu, Backend::Gl),
             report("Card", DeviceType::DiscreteGpu, Backend::Vulkan),
         ]
@@ -354,7 +365,7 @@ mod tests {
 
     #[test]
     fn a_cpu_rasteriser_gives_way_to_a_real_gpu_on_gl_and_to_nothing_else_there() {
-        let lavapipe = report("llvmpipe", DeviceType::Cpu, Backend::Vulkan);
+        let lavapipe = report(LLVMPIPE, DeviceType::Cpu, Backend::Vulkan);
         assert!(!outranks_gl(&lavapipe.info));
         for kind in KINDS {
             let gl = report("gl", kind, Backend::Gl);
@@ -394,15 +405,35 @@ mod tests {
     fn an_unknown_name_lists_what_there_is() {
         let error = choose(&three(), &wants("radeon")).unwrap_err().to_string();
         assert!(error.contains("radeon") && error.contains("--adapter"));
-        assert!(error.contains("0: llvmpipe (vulkan)"), "{error}");
+        assert!(
+            error.contains(&format!("0: {LLVMPIPE} (vulkan)")),
+            "{error}"
+        );
     }
 
     #[test]
     fn an_index_beyond_the_list_is_unknown() {
-        assert!(matches!(
-            choose(&three(), &wants("3")),
-            Err(GpuError::UnknownAdapter { .. })
-        ));
+        // Each is in the name of the first adapter, but for the first.
+        for index in ["3", "5", "6", "15", "25", "56"] {
+            let found = choose(&three(), &wants(index));
+            assert!(
+                matches!(found, Err(GpuError::UnknownAdapter { .. })),
+                "{index}: {found:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_number_that_is_a_word_of_a_name_is_found() {
+        let mut reports = three();
+        reports[1].info.name = "GeForce GTX 1080".into();
+        reports[2].info.name = "GeForce RTX 3080 Ti".into();
+        assert_eq!(chosen(&reports, &wants("1080")), Some(1));
+        assert_eq!(chosen(&reports, &wants("3080")), Some(2));
+        assert_eq!(chosen(&reports, &wants("256")), Some(0));
+        // Negative control: a part of a word. With a letter it is found all the same.
+        assert_eq!(chosen(&reports, &wants("080")), None);
+        assert_eq!(chosen(&reports, &wants("x 30")), Some(2));
     }
 
     #[test]
