@@ -8,7 +8,7 @@ use proptest::prelude::*;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
 use serde_json::{Value, json};
-use whereabot::network::Model;
+use whereabot::network::{Model, Network, Parameters, Shape};
 
 fn small() -> Value {
     description(24, 16, 4)
@@ -408,4 +408,37 @@ proptest! {
 fn a_missing_file_is_named() {
     let error = Model::load("no/such/robot.safetensors").unwrap_err();
     assert_says(&error.to_string(), &["no/such/robot.safetensors"]);
+}
+
+#[test]
+fn parameters_of_other_lengths_than_the_layer_s_are_refused() {
+    let build = |weight: usize, bias: usize| {
+        let layer =
+            serde_json::from_value(json!({"name": "layer", "op": "dense", "inputs": ["input"],
+            "out_features": 3, "activation": "none"}));
+        Network::new(
+            "input",
+            Shape::new(2, 1, 2),
+            vec![layer.unwrap()],
+            |_, _, _| {
+                Ok(Parameters {
+                    weight: vec![0.0; weight],
+                    bias: vec![0.0; bias],
+                })
+            },
+        )
+        .map_err(|error| error.to_string())
+    };
+    for (weight, bias, part) in [
+        (0, 3, "`layer.weight`: expected 12 values"),
+        (11, 3, "found 11 values"),
+        (13, 3, "found 13 values"),
+        (12, 0, "`layer.bias`: expected 3 values"),
+        (12, 4, "found 4 values"),
+    ] {
+        let error = build(weight, bias).unwrap_err();
+        assert!(error.contains(part), "`{part}` is not in: {error}");
+    }
+    // Negative control: what it asked for.
+    build(12, 3).unwrap();
 }

@@ -44,6 +44,19 @@ pub struct Network {
     nodes: Vec<Node>,
 }
 
+/// Kernels rely on it: some run without checks of bounds.
+fn check_length(layer: &str, kind: &str, dims: &[usize], found: usize) -> Result<(), NetworkError> {
+    let expected: usize = dims.iter().product();
+    if found == expected {
+        return Ok(());
+    }
+    Err(NetworkError::Tensor {
+        tensor: format!("{layer}.{kind}"),
+        expected: format!("{expected} values, of dimensions {dims:?}"),
+        found: format!("{found} values"),
+    })
+}
+
 /// Of all layers together: a gigabyte in f32, for a file of a few bytes may ask for more than a machine has. Geometry is
 /// 32-bit in the kernels.
 const MOST_VALUES: usize = 1 << 28;
@@ -54,7 +67,7 @@ impl Network {
     ///
     /// # Errors
     /// A layer that names an unknown or later input, a name used twice, an operation with impossible
-    /// numbers, a network without layers, or what `parameters` answers.
+    /// numbers, a network without layers, parameters of other lengths than these dimensions have, or what `parameters` answers.
     pub fn new(
         input_name: &str,
         input: Shape,
@@ -99,7 +112,10 @@ impl Network {
                             "weight: expected fewer than 2^31 values, found dimensions {weight:?}"
                         )));
                     }
-                    Some(parameters(&layer.name, &weight, &bias)?)
+                    let values = parameters(&layer.name, &weight, &bias)?;
+                    check_length(&layer.name, "weight", &weight, values.weight.len())?;
+                    check_length(&layer.name, "bias", &bias, values.bias.len())?;
+                    Some(values)
                 }
                 None => None,
             };

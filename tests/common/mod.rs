@@ -289,8 +289,8 @@ pub fn tensor_dims(description: &serde_json::Value) -> Vec<(String, Vec<usize>)>
             dims.push((format!("{network}.{layer}.weight"), weight.to_vec()));
             dims.push((format!("{network}.{layer}.bias"), bias.to_vec()));
             Ok(Parameters {
-                weight: vec![],
-                bias: vec![],
+                weight: vec![0.0; weight.iter().product()],
+                bias: vec![0.0; bias[0]],
             })
         })
         .unwrap();
