@@ -137,9 +137,17 @@ fn a_file_of_another_network_is_refused() {
 #[test]
 fn descriptions_that_mean_something_else_are_refused() {
     type Change = fn(&mut Value);
-    let changes: [(Change, &[&str]); 24] = [
+    let changes: [(Change, &[&str]); 25] = [
         (
             |d| d["version"] = json!(2),
+            &["version: expected 1, found 2"],
+        ),
+        // Whatever else a later version has.
+        (
+            |d| {
+                d["version"] = json!(2);
+                d["surprise"] = json!(1);
+            },
             &["version: expected 1, found 2"],
         ),
         (|d| d["surprise"] = json!(1), &["surprise"]),

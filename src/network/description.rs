@@ -137,20 +137,33 @@ impl Description {
     /// The version of the description that this library reads.
     pub const VERSION: u32 = 1;
 
+    /// Reads it from JSON, and checks it.
+    ///
+    /// # Errors
+    /// The field, what was expected and what was found.
+    pub(super) fn from_json(json: &str) -> Result<Self, String> {
+        #[derive(Deserialize)]
+        struct Version {
+            version: u32,
+        }
+        // First: what another version has besides is not what is wrong with it.
+        let Version { version } = serde_json::from_str(json).map_err(|e| e.to_string())?;
+        if version != Self::VERSION {
+            let expected = Self::VERSION;
+            return Err(format!("version: expected {expected}, found {version}"));
+        }
+        let description: Self = serde_json::from_str(json).map_err(|e| e.to_string())?;
+        description.check()?;
+        Ok(description)
+    }
+
     /// Checks what the types do not say.
-    pub(super) fn check(&self) -> Result<(), String> {
+    fn check(&self) -> Result<(), String> {
         let Self {
             camera: Intrinsics { fx, fy, cx, cy },
             input: InputSize { width, height },
             ..
         } = *self;
-        if self.version != Self::VERSION {
-            return Err(format!(
-                "version: expected {}, found {}",
-                Self::VERSION,
-                self.version
-            ));
-        }
         // Sides up to 8192 keep every index of an image 32-bit.
         if !(1..=8192).contains(&width) || !(1..=8192).contains(&height) {
             return Err(format!(

@@ -104,9 +104,7 @@ impl Model {
                     Self::METADATA_KEY
                 ))
             })?;
-        let description: Description =
-            serde_json::from_str(json).map_err(|e| describe(e.to_string()))?;
-        description.check().map_err(describe)?;
+        let description = Description::from_json(json).map_err(describe)?;
 
         let mut used = HashSet::new();
         let image = Shape::new(
