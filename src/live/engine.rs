@@ -168,26 +168,45 @@ impl Engine for GpuEngine {
             mask,
         } = self.options;
         for model in &self.models {
-            let sizes = BATCHES
-                .into_iter()
-                .filter(|&size| size == 1 || size <= largest)
-                .map(|batch| {
-                    let options = BatchOptions {
-                        precision,
-                        cameras,
-                        batch,
-                        in_flight: IN_FLIGHT,
-                        mask,
-                    };
-                    let mut locator = BatchLocator::new(Arc::clone(&device), model, options)?;
-                    warm_up(&mut locator, batch)?;
-                    Ok((batch, locator))
-                })
-                .collect::<Result<Vec<_>, LocateError>>()?;
+            let sizes = planned(largest, |batch| {
+                let options = BatchOptions {
+                    precision,
+                    cameras,
+                    batch,
+                    in_flight: IN_FLIGHT,
+                    mask,
+                };
+                let mut locator = BatchLocator::new(Arc::clone(&device), model, options)?;
+                warm_up(&mut locator, batch)?;
+                Ok(locator)
+            })?;
             self.robots.push(sizes);
         }
         Ok(())
     }
+}
+
+/// What `plan` makes of each batch size up to `largest`, the largest first. Sizes that the device has no room for are left
+/// out: smaller ones do their work. One image must have room.
+fn planned<T>(
+    largest: usize,
+    mut plan: impl FnMut(usize) -> Result<T, LocateError>,
+) -> Result<Vec<(usize, T)>, LocateError> {
+    let mut sizes = Vec::new();
+    for batch in BATCHES
+        .into_iter()
+        .filter(|&size| size == 1 || size <= largest)
+    {
+        match plan(batch) {
+            Err(LocateError::Gpu(error @ (GpuError::OutOfMemory(_) | GpuError::Limit { .. })))
+                if batch > 1 =>
+            {
+                log::warn!("no batches of {batch}: {error}")
+            }
+            made => sizes.push((batch, made?)),
+        }
+    }
+    Ok(sizes)
 }
 
 /// Runs everything once, on blank images.
@@ -270,5 +289,48 @@ impl Engine for CpuEngine {
     fn reopen(&mut self) -> Result<(), LocateError> {
         self.answers.clear();
         Ok(())
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    fn no_room() -> LocateError {
+        GpuError::OutOfMemory("none".into()).into()
+    }
+
+    fn too_large() -> LocateError {
+        GpuError::Limit {
+            what: "bytes".into(),
+            needed: 2,
+            allowed: 1,
+            adapter: "small".into(),
+        }
+        .into()
+    }
+
+    fn lost() -> LocateError {
+        GpuError::Lost("gone".into()).into()
+    }
+
+    /// The sizes that are left where those over `most` are refused.
+    fn left(most: usize, refusal: fn() -> LocateError) -> Result<Vec<usize>, LocateError> {
+        let plan = |batch| if batch > most { Err(refusal()) } else { Ok(()) };
+        let planned = planned(8, plan)?;
+        Ok(planned.into_iter().map(|(size, ())| size).collect())
+    }
+
+    #[test]
+    fn batches_without_room_are_left_out() {
+        for refusal in [no_room, too_large] {
+            assert_eq!(left(8, refusal).unwrap(), [8, 4, 2, 1]);
+            assert_eq!(left(2, refusal).unwrap(), [2, 1]);
+            assert_eq!(left(1, refusal).unwrap(), [1]);
+            left(0, refusal).unwrap_err();
+        }
+        // Negative control: another fault is no question of room.
+        left(2, lost).unwrap_err();
     }
 }
