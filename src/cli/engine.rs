@@ -129,9 +129,11 @@ fn keep(device: &Device, name: FileName, bytes: &[u8]) {
     }
 }
 
-/// Where what is known of an adapter is kept; `None` where users have no folder for caches.
+/// Where what is known of an adapter by a backend is kept: another backend's driver compiles otherwise. `None` where users
+/// have no folder for caches.
 fn cache_file(device: &Device, name: FileName) -> Option<PathBuf> {
-    let adapter = device.info().name.to_lowercase();
+    let info = device.info();
+    let adapter = format!("{}-{}", info.name, info.backend).to_lowercase();
     let adapter = adapter.replace(|c: char| !c.is_ascii_alphanumeric(), "-");
     let other = std::env::var_os(PIPELINES_FOLDER).filter(|_| name == PIPELINES);
     let folder = match other {
