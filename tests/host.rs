@@ -121,6 +121,18 @@ impl Host {
         locator.wait(PATIENCE).unwrap().unwrap()
     }
 
+    /// Makes `encoder` one whose submission is refused.
+    fn spoil(&self, encoder: &mut wgpu::CommandEncoder) {
+        // Something of the host's, that it may not clear.
+        let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: None,
+            size: 4,
+            usage: wgpu::BufferUsages::UNIFORM,
+            mapped_at_creation: false,
+        });
+        encoder.clear_buffer(&buffer, 0, None);
+    }
+
     fn bytes(&self, buffer: &wgpu::Buffer) -> Vec<u8> {
         let staging = self.device.create_buffer(&wgpu::BufferDescriptor {
             label: None,
@@ -666,14 +678,7 @@ fn a_frame_that_did_not_run_has_no_results() {
         }
         assert!(locator.read_back(&mut encoder, frame).unwrap());
         if is_refused {
-            // Something of the host's, that it may not clear.
-            let buffer = host.device.create_buffer(&wgpu::BufferDescriptor {
-                label: None,
-                size: 4,
-                usage: wgpu::BufferUsages::UNIFORM,
-                mapped_at_creation: false,
-            });
-            encoder.clear_buffer(&buffer, 0, None);
+            host.spoil(&mut encoder);
         }
         host.queue.submit([encoder.finish()]);
         assert_eq!(pollster::block_on(scope.pop()).is_some(), is_refused);
@@ -684,6 +689,51 @@ fn a_frame_that_did_not_run_has_no_results() {
             assert!(agree(&located.estimates[0], &expected(&model, &picture(2))));
         }
     }
+}
+
+#[test]
+fn probabilities_are_those_behind_the_newest_results_or_none() {
+    let (host, model) = (Host::new(), model());
+    let mut locator = host.locator(&model);
+    let source = |seed| Source::new(host.rgba(&picture(seed)), camera(WIDTH, HEIGHT));
+    let probabilities =
+        |locator: &HostLocator| pollster::block_on(locator.probabilities_async()).unwrap();
+    let shows = |locator: &HostLocator, seed: u64| {
+        let mask = expected(&model, &picture(seed)).mask.unwrap();
+        difference(&probabilities(locator).unwrap(), &mask.probability).unwrap() < 1e-4
+    };
+    locator.set_source(0, &source(1)).unwrap();
+    assert_eq!(probabilities(&locator), None);
+    host.run(&mut locator);
+    assert!(shows(&locator, 1) && shows(&locator, 1));
+    // Negative control: another picture's.
+    assert!(!shows(&locator, 2));
+
+    // A frame that is refused.
+    locator.set_source(0, &source(2)).unwrap();
+    let scope = host.device.push_error_scope(wgpu::ErrorFilter::Validation);
+    let mut encoder = host.device.create_command_encoder(&Default::default());
+    locator.encode(&mut encoder).unwrap();
+    locator.read_back(&mut encoder, 2).unwrap();
+    host.spoil(&mut encoder);
+    host.queue.submit([encoder.finish()]);
+    assert!(pollster::block_on(scope.pop()).is_some());
+    assert!(locator.wait(PATIENCE).unwrap().is_none());
+    assert_eq!(probabilities(&locator), None);
+    host.run(&mut locator);
+    assert!(shows(&locator, 2));
+
+    // One that is dropped changes nothing; one whose results nobody asked for writes over the masks.
+    let mut encoder = host.device.create_command_encoder(&Default::default());
+    locator.encode(&mut encoder).unwrap();
+    locator.read_back(&mut encoder, 3).unwrap();
+    drop(encoder);
+    assert!(locator.latest().unwrap().is_none());
+    assert!(shows(&locator, 2));
+    let mut encoder = host.device.create_command_encoder(&Default::default());
+    locator.encode(&mut encoder).unwrap();
+    host.queue.submit([encoder.finish()]);
+    assert_eq!(probabilities(&locator), None);
 }
 
 #[test]

@@ -49,6 +49,8 @@ pub struct HostLocator {
     views: Vec<Option<View>>,
     idle: Vec<Slot>,
     in_flight: VecDeque<Flight>,
+    /// The run whose results were given last; `None` where a frame that came back later did not run.
+    located: Option<u32>,
 }
 
 /// What a [`HostLocator`] is made for.
@@ -188,6 +190,7 @@ impl HostLocator {
             views: vec![None; batch],
             idle,
             in_flight: VecDeque::with_capacity(options.in_flight),
+            located: None,
         })
     }
 
@@ -271,14 +274,18 @@ impl HostLocator {
         self.outputs.masks().get(index).map(|mask| mask.view())
     }
 
-    /// The probabilities that the masks show, in full precision: `[image][row][column]`, of the network's size
-    /// in the canonical camera of the model, of the last frame that was submitted. Submits a copy and waits
-    /// for it: in a browser without blocking, elsewhere blocking all the same.
+    /// The probabilities behind the newest results that [`HostLocator::latest`] or those that wait gave, in full
+    /// precision: `[image][row][column]`, of the network's size in the canonical camera of the model. `None` where there
+    /// are no results yet, where a frame that was read back after them did not run, and where one ran that was not. Submits
+    /// a copy and waits for it: in a browser without blocking, elsewhere blocking all the same.
     ///
     /// # Errors
     /// As [`Device::wait`].
-    pub async fn probabilities_async(&self) -> Result<Vec<f32>, LocateError> {
-        Ok(self.plan.mask().read_async(&self.device).await?)
+    pub async fn probabilities_async(&self) -> Result<Option<Vec<f32>>, LocateError> {
+        let Some(run) = self.located else {
+            return Ok(None);
+        };
+        Ok(self.plan.masks_of_async(&self.device, run).await?)
     }
 
     /// What was found, for the host's shaders: `array<Estimate>`, one an image of the batch, in a storage
@@ -392,6 +399,7 @@ impl HostLocator {
             };
             match frames {
                 Ok(Some(frames)) => {
+                    self.located = Some(self.plan.last_run());
                     let estimates = frames.into_iter().zip(&slot.views);
                     let estimates = estimates.map(|(frame, view)| {
                         Estimate::new(&self.description, frame, view, Output::default())
@@ -401,6 +409,7 @@ impl HostLocator {
                         estimates: estimates.collect(),
                     });
                 }
+                Ok(None) if state == Mapped::Ready => self.located = None,
                 Ok(None) => {}
                 Err(error) => failure = Some(error),
             }

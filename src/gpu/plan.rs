@@ -379,6 +379,36 @@ impl Plan {
         Some(frames.collect())
     }
 
+    /// Which run the frame was whose results were read last.
+    pub(crate) fn last_run(&self) -> u32 {
+        self.last_run
+    }
+
+    /// The masks `[image][row][column]` of run `run`; `None` where a later one wrote over them. Submits a copy and waits
+    /// for it: in a browser without blocking, elsewhere blocking all the same.
+    ///
+    /// # Errors
+    /// As [`Device::wait`].
+    pub(crate) async fn masks_of_async(
+        &self,
+        device: &Device,
+        run: u32,
+    ) -> Result<Option<Vec<f32>>, GpuError> {
+        let masks = self.mask.output();
+        let (end, size) = (masks.staging_size(), self.runs.size());
+        let staging = device.scoped(|| Ok(staging_buffer(device, end + size)))?;
+        let mut encoder = device.wgpu().create_command_encoder(&Default::default());
+        masks.copy_to(&mut encoder, &staging, 0);
+        encoder.copy_buffer_to_buffer(&self.runs, 0, &staging, end, size);
+        device.queue().submit([encoder.finish()]);
+        let values = device.read_async(&staging, |bytes| {
+            let (bytes, runs) = bytes.split_at(end as usize);
+            let is_that = bytemuck::pod_read_unaligned::<u32>(runs) == run;
+            is_that.then(|| masks.values(bytes))
+        });
+        values.await
+    }
+
     /// What is wrong with a device of our own where [`Self::frames_in`] finds nothing.
     pub(crate) fn not_run() -> GpuError {
         GpuError::Lost("a frame that was submitted did not run".into())

@@ -100,7 +100,8 @@ impl Gpu {
     /// The last picture's mask at the network's size, row by row.
     pub async fn probabilities(&self) -> Result<Vec<f32>, JsError> {
         let finder = self.finder.as_ref().ok_or_else(not_loaded)?;
-        Ok(finder.locator.probabilities_async().await?)
+        let probabilities = finder.locator.probabilities_async().await?;
+        probabilities.ok_or_else(|| JsError::new("the last picture was not searched"))
     }
 
     /// Measures the model, tells `script` what is being measured, and gives the report's JSON.
