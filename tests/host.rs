@@ -754,6 +754,29 @@ fn results_can_be_awaited() {
 }
 
 #[test]
+fn a_frame_that_is_not_submitted_keeps_no_other_from_being_awaited() {
+    let (host, model) = (Host::new(), model());
+    let mut locator = host.locator(&model);
+    let source = Source::new(host.rgba(&picture(1)), camera(WIDTH, HEIGHT));
+    locator.set_source(0, &source).unwrap();
+    let mut recorded = [1, 2].map(|frame| {
+        let mut encoder = host.device.create_command_encoder(&Default::default());
+        locator.encode(&mut encoder).unwrap();
+        locator.read_back(&mut encoder, frame).unwrap();
+        Some(encoder)
+    });
+    for (place, frame) in [(1, 2), (0, 1)] {
+        host.queue
+            .submit(recorded[place].take().map(|e| e.finish()));
+        let located = pollster::block_on(locator.next()).unwrap().unwrap();
+        assert_eq!(located.frame, frame);
+        assert!(agree(&located.estimates[0], &expected(&model, &picture(1))));
+    }
+    // Negative control: then none is on its way.
+    assert!(pollster::block_on(locator.next()).unwrap().is_none());
+}
+
+#[test]
 fn a_locator_that_is_dropped_in_mid_flight_harms_nobody() {
     let (host, model) = (Host::new(), model());
     let source = Source::new(host.rgba(&picture(1)), camera(WIDTH, HEIGHT));

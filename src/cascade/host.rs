@@ -1,5 +1,6 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
+use std::task::Poll;
 
 use super::view::View;
 use super::{Estimate, LocateError, Output};
@@ -448,14 +449,20 @@ impl HostLocator {
     pub async fn next(&mut self) -> Result<Option<Located>, LocateError> {
         loop {
             let newest = self.latest()?;
-            let Some(first) = self.in_flight.front_mut().filter(|_| newest.is_none()) else {
+            if newest.is_some() || self.in_flight.is_empty() {
                 return Ok(newest);
-            };
-            let mapping = &mut first.mapping;
+            }
+            let in_flight = &mut self.in_flight;
             #[cfg(not(target_arch = "wasm32"))]
             let mut poller = poller::Poller::new(&self.device);
             let arrival: Result<(), GpuError> = std::future::poll_fn(|context| {
-                let arrived = mapping.poll_arrival(context).map(|_| Ok(()));
+                // Hosts submit in any order, or not at all; each must know whom to wake.
+                let mut arrived = Poll::Pending;
+                for flight in in_flight.iter_mut() {
+                    if flight.mapping.poll_arrival(context).is_ready() {
+                        arrived = Poll::Ready(Ok(()));
+                    }
+                }
                 #[cfg(not(target_arch = "wasm32"))]
                 if arrived.is_pending() {
                     return poller.poll_failure(context).map(Err);
