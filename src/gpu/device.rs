@@ -350,7 +350,7 @@ impl Device {
         })
     }
 
-    /// Polls the device, or waits for it.
+    /// Polls the device, or waits for it. A callback of somebody's that panics goes on panicking.
     ///
     /// # Errors
     /// As [`Device::wait`].
@@ -372,7 +372,9 @@ impl Device {
             Ok(Ok(_)) => Ok(()),
             Ok(Err(wgpu::PollError::Timeout)) => Err(GpuError::Timeout(Self::TIMEOUT)),
             Ok(Err(other)) => Err(GpuError::Lost(other.to_string())),
-            Err(_) => Err(GpuError::Lost("polling it panicked".into())),
+            Err(panic) if is_fatal(&*panic) => Err(GpuError::Lost("polling it panicked".into())),
+            // The device is sound: a callback panicked, that of a host perhaps.
+            Err(panic) => std::panic::resume_unwind(panic),
         }
     }
 
@@ -433,6 +435,13 @@ impl Device {
     }
 }
 
+/// Whether it is what wgpu says of a poll that failed.
+#[cfg(not(target_arch = "wasm32"))]
+fn is_fatal(panic: &(dyn std::any::Any + Send)) -> bool {
+    let message = panic.downcast_ref::<String>();
+    message.is_some_and(|message| message.starts_with("Error in Device::poll"))
+}
+
 /// A buffer that is to be mapped, for somebody who may stop waiting: it would be mapped later, and what is written to it
 /// then be refused.
 struct Pending<'a>(&'a wgpu::Buffer);
@@ -479,10 +488,12 @@ mod tests {
             .survive(|| device.device.poll(wgpu::PollType::Poll))
             .unwrap();
         // As wgpu does it: it tells the loss, then it panics.
+        let operation = "Device::poll".to_owned();
+        let panic = || panic!("Error in {operation}: Parent device is lost");
         let fatal = || {
             device.device.destroy();
             let _ = device.device.poll(wgpu::PollType::Poll);
-            panic!("Error in Device::poll: Parent device is lost")
+            panic()
         };
         assert!(is_lost(device.survive(fatal)));
         // A device that is known to be lost is not polled again.
@@ -494,7 +505,20 @@ mod tests {
         assert!(is_lost(again) && !polled);
         // Where the loss was not told, the panic tells.
         let device = Device::open(&AdapterRequest::new(None, None)).unwrap();
-        assert!(is_lost(device.survive(|| panic!("unknown"))));
+        assert!(is_lost(device.survive(panic)));
+    }
+
+    #[test]
+    fn a_callback_that_panics_is_no_loss() {
+        let device = Device::open(&AdapterRequest::new(None, None)).unwrap();
+        // Submitting calls back, too.
+        device.queue.submit([]);
+        device.queue.on_submitted_work_done(|| panic!("a host's"));
+        let wait = std::panic::AssertUnwindSafe(|| device.wait());
+        let panic = std::panic::catch_unwind(wait).unwrap_err();
+        assert_eq!(panic.downcast_ref(), Some(&"a host's"));
+        // The device goes on.
+        device.wait().unwrap();
     }
 
     #[test]
