@@ -1,3 +1,5 @@
+import json
+import math
 import shutil
 
 import numpy as np
@@ -96,12 +98,26 @@ def test_an_arm_is_measured_from_the_shoulder_to_the_wrist():
     ('{"id":2,"image":"i","mask":"m","intrinsics":{"fx":500,"fy":365,"cx":255.5,"cy":211.5}}\n', "line 3: intrinsics: fx"),
 ])
 def test_a_broken_line_is_named(recording, tmp_path, line, complaint):
-    folder = tmp_path / "broken"
-    shutil.copytree(recording, folder)
     lines = (recording / "samples.jsonl").read_text().splitlines(keepends=True)
-    (folder / "samples.jsonl").write_text("".join([*lines[:2], line, *lines[3:]]))
+    (tmp_path / "samples.jsonl").write_text("".join([*lines[:2], line, *lines[3:]]))
     with pytest.raises(data.RecordingError, match=f"samples.jsonl: {complaint}"):
-        data.Samples([folder], tmp_path / "cache")
+        data.read_samples(tmp_path)
+
+
+@pytest.mark.parametrize(("changes", "complaint"), [
+    ({}, None),
+    ({"joints_m": [[0.1, 0.2, 1.5]] * 5 + [[0.1, 0.2, 0.0]]}, "joints_m: expected 6 finite points before the camera"),
+    ({"joints_m": [[0.1, 0.2, 1.5]] * 5 + [[0.1, math.nan, 1.5]]}, "joints_m: expected 6 finite points before the camera"),
+])
+def test_what_is_wrong_with_a_sample_is_named(recording, tmp_path, changes, complaint):
+    lines = (recording / "samples.jsonl").read_text().splitlines(keepends=True)
+    lines[2] = json.dumps(json.loads(lines[2]) | changes) + "\n"
+    (tmp_path / "samples.jsonl").write_text("".join(lines))
+    if complaint is None:
+        assert len(data.read_samples(tmp_path)) == len(lines)
+        return
+    with pytest.raises(data.RecordingError, match=f"samples.jsonl: line 3: {complaint}"):
+        data.read_samples(tmp_path)
 
 
 def test_views_keep_image_and_mask_together():

@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from whereabot_trainer import data, evaluate, export, golden, pipeline
+from whereabot_trainer import data, evaluate, export, golden, losses, pipeline
 from whereabot_trainer.__main__ import main
 from whereabot_trainer.export import SURE_THRESHOLDS, choose_presence
 from whereabot_trainer.model import read_model
@@ -29,6 +29,11 @@ def train(recording, tmp_path):
 
 def _weights(run):
     return torch.load(run / "last.pt", weights_only=False)["network"]
+
+
+def _log(run):
+    with open(run / "log.csv", newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def test_a_resumed_run_goes_on_as_if_never_stopped(train, monkeypatch):
@@ -55,8 +60,7 @@ def test_a_resumed_run_goes_on_as_if_never_stopped(train, monkeypatch):
         assert torch.equal(value, _weights(parts)[key]), key
         # The average over batches stands still by then.
         assert "_norm.running" in key or "tracked" in key or not torch.equal(value, half[key]), f"{key} was not trained"
-    with open(parts / "log.csv") as file:
-        assert [row["iteration"] for row in csv.DictReader(file)] == ["3", "6"]
+    assert [row["iteration"] for row in _log(parts)] == ["3", "6"]
 
 
 def test_a_longer_run_does_not_thaw_the_normalisation(train):
@@ -71,6 +75,36 @@ def test_a_longer_run_does_not_thaw_the_normalisation(train):
     # Six of forty are less than a quarter again.
     frozen = averages(train("train-mask", "run", *flags, "40", "--resume"))
     assert all(torch.equal(frozen[key], thawed[key]) for key in thawed)
+
+
+@pytest.mark.parametrize(("spoilt", "gradient"), [(3, "inf"), (4, "nan")])
+def test_weights_that_are_not_finite_are_not_kept(train, tmp_path, monkeypatch, spoilt, gradient):
+    flags = ("--iterations", "6", "--evaluate-every", "2", "--precision", "f32", "--crop", "32", "24",
+             "--validation-samples", "2")
+    mask_loss, calls = losses.mask_loss, []
+
+    def spoil(masks, *rest):
+        calls.append(None)
+        loss = mask_loss(masks, *rest)
+        if len(calls) != spoilt:
+            return loss
+        if gradient == "nan":
+            # A finite loss, whose gradient is not: only the weights tell, and only after this step.
+            loss = loss + (masks.sum() * 0).abs().sqrt()
+            assert loss.isfinite()
+            return loss
+        return loss * math.inf
+
+    monkeypatch.setattr(losses, "mask_loss", spoil)
+    with pytest.raises(SystemExit, match="run: iteration 4: expected finite .* as it was"):
+        train("train-mask", "run", *flags)
+    monkeypatch.setattr(losses, "mask_loss", mask_loss)
+    run = tmp_path / "run"
+    assert all(value.isfinite().all() for value in _weights(run).values())
+    assert [row["iteration"] for row in _log(run)] == ["2"]
+    # What was kept goes on.
+    train("train-mask", "run", *flags, "--resume")
+    assert [row["iteration"] for row in _log(run)] == ["2", "4", "6"]
 
 
 def test_a_run_is_not_overwritten(train):

@@ -49,8 +49,9 @@ def _check_sample(sample):
         if abs(halved - value) > 1e-3:
             raise ValueError(f"intrinsics: {key}: expected {value} at half size, found {halved}")
     joints = sample.get("joints_m")
-    if joints is not None and (np.shape(joints) != (len(JOINTS), 3) or not np.isfinite(joints).all()):
-        raise ValueError(f"joints_m: expected {len(JOINTS)} finite points, found {joints!r}")
+    if joints is not None and not (np.shape(joints) == (len(JOINTS), 3) and np.isfinite(joints).all()
+                                   and (np.asarray(joints)[:, 2] > 0).all()):
+        raise ValueError(f"joints_m: expected {len(JOINTS)} finite points before the camera (z > 0), found {joints!r}")
 
 
 def read_samples(folder):

@@ -167,6 +167,11 @@ def fit(args, network, numbers, draw, batch_loss, score, card):
             seconds = before + time.monotonic() - started
             progress = (iteration if args.iterations else seconds) / budget
             if iteration % args.evaluate_every == 0 or progress >= 1:
+                # The last step's weights have not met a loss yet.
+                if not (torch.isfinite(total) and all(tensor.isfinite().all() for tensor in network.state_dict().values())):
+                    kept = f"{last} is as it was" if last.exists() else "nothing was saved"
+                    raise SystemExit(f"{out}: iteration {iteration}: expected finite loss and weights, found NaN or infinity: {kept};"
+                                     " try a lower --learning-rate")
                 network.eval()
                 figures = {"iteration": iteration, "epoch": order.state["epoch"], "seconds": round(seconds, 1),
                            "learning_rate": f"{rate:.3g}", "train_loss": round(float(total) / counted, 5), **score()}
