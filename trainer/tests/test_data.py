@@ -11,6 +11,9 @@ from whereabot_trainer import data
 from whereabot_trainer.networks import INPUT_HEIGHT, INPUT_WIDTH
 
 
+CAMERA = {"fx": 365, "fy": 365, "cx": 255.5, "cy": 211.5}
+
+
 def test_halve_is_the_mean_of_each_block():
     pixels = np.array([[0, 1, 10, 10], [2, 4, 10, 14]], np.uint8)
     assert data.halve(pixels).tolist() == [[2, 11]]
@@ -94,8 +97,10 @@ def test_an_arm_is_measured_from_the_shoulder_to_the_wrist():
 
 @pytest.mark.parametrize(("line", "complaint"), [
     ("{\n", "line 3: "),
+    ("[]\n", r"line 3: expected an object, found \[\]"),
+    ("7\n", "line 3: expected an object, found 7"),
+    ('{"mask": "m"}\n', "line 3: id: expected 2, found None"),
     ('{"id": 2, "mask": "m"}\n', "line 3: image: expected a path"),
-    ('{"id":2,"image":"i","mask":"m","intrinsics":{"fx":500,"fy":365,"cx":255.5,"cy":211.5}}\n', "line 3: intrinsics: fx"),
 ])
 def test_a_broken_line_is_named(recording, tmp_path, line, complaint):
     lines = (recording / "samples.jsonl").read_text().splitlines(keepends=True)
@@ -106,6 +111,18 @@ def test_a_broken_line_is_named(recording, tmp_path, line, complaint):
 
 @pytest.mark.parametrize(("changes", "complaint"), [
     ({}, None),
+    # Two dots within a name lead nowhere else.
+    ({"image": "a/b..c.png"}, None),
+    ({"id": "2"}, "id: expected 2, found '2'"),
+    ({"id": 2.0}, "id: expected 2, found 2.0"),
+    ({"id": 1}, "id: expected 2, found 1"),
+    ({"image": "../ok/image/000002.jpg"}, "image: expected a path inside the recording's folder"),
+    ({"mask": "/ok/mask/000002.png"}, "mask: expected a path inside the recording's folder"),
+    ({"mask": ""}, "mask: expected a path inside the recording's folder"),
+    ({"intrinsics": None}, "intrinsics: expected the numbers fx, fy, cx, cy, found None"),
+    ({"intrinsics": CAMERA | {"cx": "255.5"}}, "intrinsics: expected the numbers"),
+    ({"intrinsics": CAMERA | {"fx": 500}}, "intrinsics: fx: expected 182.5 at half size, found 250"),
+    ({"intrinsics": CAMERA | {"cx": math.nan}}, "intrinsics: cx: expected 127.5 at half size, found nan"),
     ({"joints_m": [[0.1, 0.2, 1.5]] * 5 + [[0.1, 0.2, 0.0]]}, "joints_m: expected 6 finite points before the camera"),
     ({"joints_m": [[0.1, 0.2, 1.5]] * 5 + [[0.1, math.nan, 1.5]]}, "joints_m: expected 6 finite points before the camera"),
 ])
@@ -118,6 +135,29 @@ def test_what_is_wrong_with_a_sample_is_named(recording, tmp_path, changes, comp
         return
     with pytest.raises(data.RecordingError, match=f"samples.jsonl: line 3: {complaint}"):
         data.read_samples(tmp_path)
+
+
+@pytest.mark.parametrize(("changes", "complaint"), [
+    ({}, None),
+    ({"robot": None}, "robot: expected a name, found None"),
+    ({"robot": 5}, "robot: expected a name, found 5"),
+    ({"source": [1]}, r"source: expected an object, found \[1\]"),
+    ({"version": 2}, "version: expected 1, found 2"),
+])
+def test_what_is_wrong_with_a_header_is_named(recording, tmp_path, changes, complaint):
+    header = json.loads((recording / "recording.json").read_text()) | changes
+    (tmp_path / "recording.json").write_text(json.dumps(header))
+    if complaint is None:
+        assert data.read_header(tmp_path) == header
+        return
+    with pytest.raises(data.RecordingError, match=f"recording.json: {complaint}"):
+        data.read_header(tmp_path)
+
+
+def test_a_header_is_an_object(tmp_path):
+    (tmp_path / "recording.json").write_text("[]")
+    with pytest.raises(data.RecordingError, match=r"recording.json: expected an object, found \[\]"):
+        data.read_header(tmp_path)
 
 
 def test_views_keep_image_and_mask_together():

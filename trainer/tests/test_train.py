@@ -2,6 +2,8 @@ import csv
 import json
 import math
 import shutil
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -114,6 +116,16 @@ def test_a_run_is_not_overwritten(train):
     with pytest.raises(SystemExit, match="--resume"):
         train("train-mask", "run", *flags, "--batch", "3")
     assert settings.read_text() == before
+
+
+@pytest.mark.parametrize("command", ["train-mask", "train-joint"])
+def test_what_cannot_be_done_ends_in_one_line(tmp_path, command):
+    words = [sys.executable, "-m", "whereabot_trainer", command, "--recording", str(tmp_path / "none"), "--out", str(tmp_path / "run")]
+    for more, complaint in ((["--resume"], f"--resume: expected {tmp_path / 'run' / 'last.pt'}, found none"),
+                            ([], f"{tmp_path / 'none' / 'recording.json'}: ")):
+        ended = subprocess.run([*words, *more], capture_output=True, text=True, check=False)
+        assert ended.returncode == 1
+        assert ended.stderr.startswith(complaint) and ended.stderr.count("\n") == 1, ended.stderr
 
 
 @pytest.mark.parametrize("family", ["paper", "context"])

@@ -4,7 +4,7 @@ import argparse
 
 import torch
 
-from . import export, golden, pipeline, train
+from . import data, export, golden, pipeline, train
 from .networks import OVERLAYS
 
 
@@ -156,7 +156,10 @@ def main(argv=None):
     command.set_defaults(run=lambda args: golden.write_golden(args.out))
 
     args = parser.parse_args(argv)
-    args.run(args)
+    try:
+        args.run(args)
+    except data.RecordingError as error:
+        raise SystemExit(str(error)) from error
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ import json
 import math
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import torch
@@ -31,22 +31,47 @@ def read_header(folder):
         header = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path}: {error}") from error
+    if not isinstance(header, dict):
+        raise RecordingError(f"{path}: expected an object, found {header!r}")
     for key, expected in (("format", FORMAT), ("version", VERSION), ("joints", JOINTS),
                           ("width", 2 * INPUT_WIDTH), ("height", 2 * INPUT_HEIGHT), ("frame", "camera_optical")):
         if header.get(key) != expected:
             raise RecordingError(f"{path}: {key}: expected {expected!r}, found {header.get(key)!r}")
+    for key, kind, expected in (("robot", str, "a name"), ("source", dict, "an object")):
+        if not header.get(key) or not isinstance(header[key], kind):
+            raise RecordingError(f"{path}: {key}: expected {expected}, found {header.get(key)!r}")
     return header
 
 
-def _check_sample(sample):
+def _inside(path):
+    path = PurePosixPath(path)
+    return path.parts and not path.is_absolute() and ".." not in path.parts
+
+
+def _is_number(value):
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _check_sample(sample, number):
+    if not isinstance(sample, dict):
+        raise ValueError(f"expected an object, found {sample!r}")
+    # The id tells what is kept for testing.
+    found = sample.get("id")
+    if type(found) is not int or found != number - 1:
+        raise ValueError(f"id: expected {number - 1}, found {found!r}")
     for key in ("image", "mask"):
-        if not isinstance(sample.get(key), str):
-            raise ValueError(f"{key}: expected a path, found {sample.get(key)!r}")
+        found = sample.get(key)
+        if not isinstance(found, str) or not _inside(found):
+            raise ValueError(f"{key}: expected a path inside the recording's folder, found {found!r}")
+    intrinsics = sample.get("intrinsics")
+    if not isinstance(intrinsics, dict) or not all(_is_number(intrinsics.get(key)) for key in CAMERA):
+        raise ValueError(f"intrinsics: expected the numbers {', '.join(CAMERA)}, found {intrinsics!r}")
     for key, value in CAMERA.items():
         # Pixel (0, 0) is a pixel's centre: halving the image halves cx + 0.5.
-        found = sample["intrinsics"][key]
+        found = intrinsics[key]
         halved = found / 2 if key.startswith("f") else (found + 0.5) / 2 - 0.5
-        if abs(halved - value) > 1e-3:
+        # Written so that NaN is refused.
+        if not abs(halved - value) <= 1e-3:
             raise ValueError(f"intrinsics: {key}: expected {value} at half size, found {halved}")
     joints = sample.get("joints_m")
     if joints is not None and not (np.shape(joints) == (len(JOINTS), 3) and np.isfinite(joints).all()
@@ -67,8 +92,8 @@ def read_samples(folder):
     for number, line in enumerate(lines[:-1], start=1):
         try:
             sample = json.loads(line)
-            _check_sample(sample)
-        except (ValueError, KeyError, TypeError) as error:
+            _check_sample(sample, number)
+        except (ValueError, TypeError) as error:
             raise RecordingError(f"{path}: line {number}: {error}") from error
         samples.append(sample)
     return samples
@@ -167,7 +192,7 @@ class Samples:
             ids += [sample["id"] for sample in samples]
             robots += [header["robot"]] * len(samples)
             self.sources.append({"name": Path(folder).name, "robot": header["robot"], "samples": len(samples),
-                                 **header.get("source", {})})
+                                 **header["source"]})
         self.joints = np.asarray(joints, np.float32)
         self.coverage = np.concatenate(coverage)
         self.ids = np.asarray(ids)

@@ -20,7 +20,7 @@ def steps(args):
     for folder in args.recording:
         header = data.read_header(folder)
         by_robot.setdefault(header["robot"], ([], []))[0].append(folder)
-        fixed &= header.get("source", {}).get("protocol") == "fixed_camera"
+        fixed &= header["source"].get("protocol") == "fixed_camera"
     camera = ["--camera", "fixed"] if fixed else []
     for folder in args.validation or []:
         robot = data.read_header(folder)["robot"]

@@ -117,8 +117,20 @@ class Order:
 FREEZE_NORMALISATION = 0.25
 
 
-def fit(args, network, numbers, draw, batch_loss, score, card):
-    """Trains `network` in the folder args.out.
+def kept_state(args):
+    """What to go on from with --resume; None at the start of a run, which overwrites none."""
+    last = Path(args.out) / "last.pt"
+    if args.resume:
+        if not last.exists():
+            raise SystemExit(f"--resume: expected {last}, found none: nothing is saved before a run's first evaluation")
+        return torch.load(last, weights_only=False)
+    if last.exists():
+        raise SystemExit(f"{args.out} holds a run already: add --resume to go on with it, or choose another folder")
+    return None
+
+
+def fit(args, state, network, numbers, draw, batch_loss, score, card):
+    """Trains `network` in the folder args.out, from its kept `state` on if there is one.
 
     `draw(numbers, progress)` gives a batch's inputs and truth, `batch_loss(inputs, truth)` its loss, `score()` the
     validation figures as a dict. `card` goes into the checkpoint. Rates decay to nearly nothing, so the last state is the one to use, and validation chooses nothing.
@@ -129,15 +141,12 @@ def fit(args, network, numbers, draw, batch_loss, score, card):
     order = Order(numbers, args.batch)
     iteration, before, frozen = 0, 0.0, False
     last = out / "last.pt"
-    if args.resume:
-        state = torch.load(last, weights_only=False)
+    if state is not None:
         network.load_state_dict(state["network"])
         optimizer.load_state_dict(state["optimizer"])
         order.state, iteration, before = state["order"], state["iteration"], state["seconds"]
         frozen = state["frozen"]
         _set_rng_state(state["rng"])
-    elif last.exists():
-        raise SystemExit(f"{out} holds a run already: add --resume to go on with it, or choose another folder")
     out.mkdir(parents=True, exist_ok=True)
     (out / "settings.json").write_text(json.dumps(vars(args), indent=1, default=str) + "\n")
 
@@ -302,6 +311,7 @@ def starting_tensors(path, part):
 # --- the mask network ------------------------------------------------------------------------------------------------
 
 def train_mask(args):
+    state = kept_state(args)
     samples, numbers, held_out, validation, card = load_samples(args)
     share = float(samples.coverage[numbers].mean())
     w_fg, w_bg = losses.class_weights(share)
@@ -341,7 +351,7 @@ def train_mask(args):
         shift = evaluate.calibrate(network, *calibration, args.device)
         return evaluate.score_mask(network, held_out, validation, args.device, shift) | {"logit_shift": shift}
 
-    fit(args, network, numbers, draw, batch_loss, score, card)
+    fit(args, state, network, numbers, draw, batch_loss, score, card)
 
 
 # --- the joint network -----------------------------------------------------------------------------------------------
@@ -443,6 +453,7 @@ def heat_loss(heat, place, truth):
 
 
 def train_joint(args):
+    state = kept_state(args)
     samples, numbers, held_out, validation, card = load_samples(args)
     numbers, validation = (
         chosen[part.has_robot[chosen] & (part.coverage[chosen] >= args.min_coverage)]
@@ -455,8 +466,7 @@ def train_joint(args):
         view = None
         layers = paper_joint_layers(args.dilations, args.pool)
         # A recording may have grown since: what is resumed keeps its unit.
-        unit = (output_unit(torch.load(Path(args.out) / "last.pt", weights_only=False)["card"]) if args.resume
-                else Standardised.of(samples.joints[numbers]))
+        unit = output_unit(state["card"]) if state else Standardised.of(samples.joints[numbers])
     card |= {"family": args.family, "samples": len(numbers), "camera": args.camera, "overlay": rule, "zoom": view, "min_coverage": args.min_coverage,
              "estimated_masks": args.estimated_masks, "estimated_after": args.estimated_after, **unit.card()}
     network = initialise(Network(layers, JOINT_INPUT, normalise=args.normalise))
@@ -522,4 +532,4 @@ def train_joint(args):
                     network, unit.metres, held_out, validation, masks, (rule, view), args.device, name)
         return figures
 
-    fit(args, network, numbers, draw, batch_loss, score, card)
+    fit(args, state, network, numbers, draw, batch_loss, score, card)
