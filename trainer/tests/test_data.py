@@ -50,6 +50,25 @@ def test_another_picture_under_the_same_name_is_read(recording, tmp_path):
     assert (after[0] * 255).round().eq(9).all() and not torch.equal(after[0], before[0])
 
 
+@pytest.mark.parametrize("index", [b"", b'{"count": 4', b"7", b'{"count": 40}', b'{"count": "x", "digest": 1}', b"\xff"])
+def test_an_unreadable_index_is_none(recording, tmp_path, monkeypatch, index):
+    cache = tmp_path / "cache"
+    before = data.Samples([recording], cache).pixels([4, 5])[0]
+    decode, decoded = data._decode, []
+
+    def count(folder, number, sample):
+        decoded.append(number)
+        return decode(folder, number, sample)
+
+    monkeypatch.setattr(data, "_decode", count)
+    data.Samples([recording], cache)
+    assert not decoded
+    path, = cache.glob("*.json")
+    path.write_bytes(index)
+    assert torch.equal(data.Samples([recording], cache).pixels([4, 5])[0], before)
+    assert sorted(decoded) == list(range(1, 41))
+
+
 def test_who_reads_the_cache_keeps_what_was_in_it(recording, tmp_path):
     folder = tmp_path / "redrawn"
     shutil.copytree(recording, folder)

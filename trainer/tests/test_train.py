@@ -38,7 +38,7 @@ def _log(run):
         return list(csv.DictReader(file))
 
 
-def test_a_resumed_run_goes_on_as_if_never_stopped(train, monkeypatch):
+def test_a_resumed_run_goes_on_as_if_never_stopped(train, tmp_path, monkeypatch):
     flags = ("--iterations", "6", "--evaluate-every", "3", "--precision", "f32", "--crop", "32", "24",
              "--validation-samples", "2")
     whole = train("train-mask", "whole", *flags)
@@ -56,13 +56,18 @@ def test_a_resumed_run_goes_on_as_if_never_stopped(train, monkeypatch):
         train("train-mask", "parts", *flags)
     half = {key: value.clone() for key, value in _weights(whole.parent / "parts").items()}
     monkeypatch.setattr(evaluate, "score_mask", score)
+    # As if the second evaluation had been logged, a third half, and neither saved.
+    log = tmp_path / "parts" / "log.csv"
+    header, row = log.read_text().splitlines()
+    log.write_text(f"{header}\n{row}\n6{row[1:]}\n9,0,1")
     parts = train("train-mask", "parts", *flags, "--resume")
 
     for key, value in _weights(whole).items():
         assert torch.equal(value, _weights(parts)[key]), key
         # The average over batches stands still by then.
         assert "_norm.running" in key or "tracked" in key or not torch.equal(value, half[key]), f"{key} was not trained"
-    assert [row["iteration"] for row in _log(parts)] == ["3", "6"]
+    logs = [[row | {"seconds": None} for row in _log(run)] for run in (parts, whole)]
+    assert logs[0] == logs[1] and [row["iteration"] for row in logs[0]] == ["3", "6"]
 
 
 def test_a_longer_run_does_not_thaw_the_normalisation(train):

@@ -148,16 +148,19 @@ def _locked_pixels(folder, samples, cache, stem):
         return hashlib.sha256(json.dumps([samples[:count], files[:count]]).encode()).hexdigest()
 
     done = 0
-    if index.exists():
+    try:
         known = json.loads(index.read_text())
         if known["count"] <= len(samples) and known["digest"] == digest(known["count"]):
             done = known["count"]
+    except (OSError, ValueError, KeyError, TypeError):
+        # All can be decoded again.
+        pass
     shapes = {"images": (INPUT_HEIGHT, INPUT_WIDTH, 3), "masks": (INPUT_HEIGHT, INPUT_WIDTH)}
     paths = {key: cache / f"{stem}.{key}.u8" for key in shapes}
     if done < len(samples):
         if not done:
             # Somebody may train on what was there: it stays theirs.
-            for path in paths.values():
+            for path in (index, *paths.values()):
                 path.unlink(missing_ok=True)
         with open(paths["images"], "ab") as images, open(paths["masks"], "ab") as masks, ThreadPoolExecutor() as pool:
             images.truncate(done * math.prod(shapes["images"]))
@@ -166,7 +169,9 @@ def _locked_pixels(folder, samples, cache, stem):
             for image, mask in tqdm(jobs, f"decoding {folder.name}", len(samples) - done, mininterval=5):
                 images.write(image.tobytes())
                 masks.write(mask.tobytes())
-        index.write_text(json.dumps({"count": len(samples), "digest": digest(len(samples))}))
+        partial = index.with_suffix(".partial")
+        partial.write_text(json.dumps({"count": len(samples), "digest": digest(len(samples))}))
+        partial.replace(index)
     return tuple(np.memmap(paths[key], np.uint8, "r", shape=(len(samples), *shape)) for key, shape in shapes.items())
 
 

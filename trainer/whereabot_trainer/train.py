@@ -147,6 +147,7 @@ def fit(args, state, network, numbers, draw, batch_loss, score, card):
         order.state, iteration, before = state["order"], state["iteration"], state["seconds"]
         frozen = state["frozen"]
         _set_rng_state(state["rng"])
+        _drop_rows_after(out / "log.csv", iteration)
     out.mkdir(parents=True, exist_ok=True)
     (out / "settings.json").write_text(json.dumps(vars(args), indent=1, default=str) + "\n")
 
@@ -216,6 +217,20 @@ def _append_csv(path, row):
         if new:
             writer.writeheader()
         writer.writerow(row)
+
+
+def _drop_rows_after(path, iteration):
+    """Leaves out of a log what was logged after the state that is gone on from: it will be logged again."""
+    if not path.exists():
+        return
+    with open(path, newline="") as file:
+        rows = list(csv.reader(file))
+    partial = path.with_suffix(".partial")
+    with open(partial, "w", newline="") as file:
+        # The last row may be cut off.
+        csv.writer(file).writerows(
+            row for row in rows if row == rows[0] or (len(row) >= len(rows[0]) and int(row[0]) <= iteration))
+    partial.replace(path)
 
 
 # --- what both tasks share -------------------------------------------------------------------------------------------
