@@ -6,6 +6,7 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -155,6 +156,61 @@ def test_export_folds_calibration_and_unit(train, recording, tmp_path, family):
     metres = output_unit(joint_state["card"]).metres(trained_joint(images), arms)
     assert torch.allclose(joint(images).reshape(-1, 6, 3), metres, atol=1e-4)
     assert not torch.allclose(joint(images), trained_joint(images), atol=1e-2)
+
+
+def _enlarge(recording, factor):
+    """Makes the arm of a recording so much longer."""
+    samples = [json.loads(line) for line in (recording / "samples.jsonl").read_text().splitlines()]
+    for sample in samples:
+        if "joints_m" in sample:
+            sample["joints_m"] = (factor * np.array(sample["joints_m"])).tolist()
+    (recording / "samples.jsonl").write_text("".join(json.dumps(sample) + "\n" for sample in samples))
+
+
+def test_arms_are_as_long_as_they_were_for_training(recording, tmp_path, monkeypatch):
+    training, validation, cache = tmp_path / "training", tmp_path / "validation", tmp_path / "cache"
+    for folder in (training, validation):
+        shutil.copytree(recording, folder)
+    _enlarge(validation, 1.1)
+    length, other = (data.Samples([folder], cache).arm_lengths["ur5"] for folder in (training, validation))
+    assert other == pytest.approx(1.1 * length)
+    score, scored_in = evaluate.score_joints, []
+
+    def spy(network, metres, samples, *rest):
+        scored_in.append(samples.arms[0])
+        return score(network, metres, samples, *rest)
+
+    monkeypatch.setattr(evaluate, "score_joints", spy)
+    given = ["--cache", str(cache), "--validation-samples", "20"]
+    run, mask = tmp_path / "run", tmp_path / "mask"
+
+    def train(command, out, *flags):
+        main([command, "--recording", str(training), "--validation", str(validation), "--out", str(out), "--batch", "4",
+              *given, *flags])
+
+    def exported_length():
+        main(["export", "--mask", str(mask), "--joint", str(run), "--validation", str(validation), *given,
+              "--out", str(tmp_path / "model.safetensors")])
+        _, joint, description = read_model(tmp_path / "model.safetensors")
+        added = joint.dense2.bias[2] - load_network(run)[0].dense2.bias[2]
+        assert added.item() == pytest.approx(math.log(description["card"]["arm_length_m"]), abs=1e-6)
+        return description["card"]["arm_length_m"]
+
+    train("train-mask", mask, "--iterations", "1", "--crop", "32", "24")
+    train("train-joint", run, "--iterations", "1", "--family", "context")
+    assert exported_length() == pytest.approx(length)
+    # What the training recording has become since is another unit.
+    _enlarge(training, 1.2)
+    train("train-joint", run, "--iterations", "2", "--family", "context", "--resume")
+    assert exported_length() == pytest.approx(length)
+    assert len(scored_in) >= 4 and scored_in == pytest.approx([length] * len(scored_in))
+    # A run whose card says nothing has the length that is measured.
+    state = torch.load(run / "last.pt", weights_only=False)
+    del state["card"]["arm_lengths_m"]
+    torch.save(state, run / "last.pt")
+    assert exported_length() == pytest.approx(other)
+    train("train-joint", run, "--iterations", "3", "--family", "context", "--resume")
+    assert exported_length() == pytest.approx(1.2 * length)
 
 
 def test_presence_rejects_images_without_a_robot_and_finds_the_most_robots():

@@ -180,10 +180,11 @@ class Samples:
 
     `joints` is [N, 6, 3] in metres in the camera's optical frame, NaN where there is no robot; `coverage` [N] is the
     share of robot pixels; `ids` [N] are the samples' ids in their recordings; `robots` [N] are the robots' names.
-    `arms` [N] is the length of the robot's arm in metres (see `arm_length`): all recordings of a robot have the same.
+    `arms` [N] is the length of the robot's arm in metres: all recordings of a robot have the same. It is in `arm_lengths` by
+    the robot's name, as it is given or else measured (see `arm_length`).
     """
 
-    def __init__(self, folders, cache):
+    def __init__(self, folders, cache, arm_lengths=None):
         self.parts, joints, coverage, ids, robots, self.sources = [], [], [], [], [], []
         for folder in folders:
             header, samples = read_header(folder), read_samples(folder)
@@ -202,9 +203,9 @@ class Samples:
         self.coverage = np.concatenate(coverage)
         self.ids = np.asarray(ids)
         self.robots = np.asarray(robots)
-        self.arms = np.empty(len(self.joints), np.float32)
-        for robot in set(robots):
-            self.arms[self.robots == robot] = arm_length(self.joints[self.robots == robot])
+        measured = {robot: arm_length(self.joints[self.robots == robot]) for robot in sorted(set(robots))}
+        self.arm_lengths = measured | (arm_lengths or {})
+        self.arms = np.asarray([self.arm_lengths[robot] for robot in robots], np.float32)
         self._starts = np.cumsum([0] + [len(images) for images, _ in self.parts])
         self._kept = None
 

@@ -11,7 +11,7 @@ import torch
 
 from . import __version__, data, evaluate, kinematic_fit
 from .model import describe, read_model, write_model
-from .train import load_mask, load_network, output_unit
+from .train import kept_arm_lengths, load_mask, load_network, output_unit
 
 # From fewer samples the errors of six joints cannot be told.
 LEAST_LEARNED = 30
@@ -61,7 +61,7 @@ def export_runs(args):
     joint, joint_state, joint_mean = _mean_of(args.joint)
     rules = joint_state["card"]["overlay"], joint_state["card"].get("zoom")
 
-    samples = data.Samples(args.validation or args.recording, args.cache)
+    samples = data.Samples(args.validation or args.recording, args.cache, kept_arm_lengths(joint_state))
     robots = sorted(set(samples.robots))
     robot = args.robot or robots[0]
     if robot not in robots or (len(robots) > 1 and not args.robot):

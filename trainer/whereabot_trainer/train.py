@@ -235,13 +235,14 @@ def _drop_rows_after(path, iteration):
 
 # --- what both tasks share -------------------------------------------------------------------------------------------
 
-def load_samples(args):
-    """(training samples, their numbers, validation samples, their numbers, the card's account of both)."""
-    samples = data.Samples(args.recording, args.cache)
+def load_samples(args, state):
+    """(training samples, their numbers, validation samples, their numbers, the card's account of both). Arms are as long as in
+    the `state` that is gone on from."""
+    samples = data.Samples(args.recording, args.cache, kept_arm_lengths(state) if state else None)
     if args.device != "cpu":
         samples.keep(args.device)
     if args.validation:
-        held_out, numbers = data.Samples(args.validation, args.cache), np.arange(len(samples))
+        held_out, numbers = data.Samples(args.validation, args.cache, samples.arm_lengths), np.arange(len(samples))
         validation = np.arange(len(held_out))
         protocol = "validated on recordings of their own"
     else:
@@ -327,7 +328,7 @@ def starting_tensors(path, part):
 
 def train_mask(args):
     state = kept_state(args)
-    samples, numbers, held_out, validation, card = load_samples(args)
+    samples, numbers, held_out, validation, card = load_samples(args, state)
     share = float(samples.coverage[numbers].mean())
     w_fg, w_bg = losses.class_weights(share)
     height, width = args.crop[1], args.crop[0]
@@ -412,7 +413,8 @@ class ArmLengths:
     """Joints [N, 6, 3] in metres and outputs in arm lengths, for networks that end in slopes and logarithms of depth:
     the unit in which one network can learn from robots of several sizes, and a new robot starts from another's.
 
-    Export folds the arm's length into the last dense layer, exactly: it is a summand of the logarithm.
+    A robot with two bodies has an arm of either's length, by a sample more or less: the run's card keeps that of its training
+    samples. Export folds it into the last dense layer, exactly: it is a summand of the logarithm.
     """
 
     def metres(self, outputs, arms):
@@ -429,6 +431,11 @@ class ArmLengths:
 
     def card(self):
         return {}
+
+
+def kept_arm_lengths(state):
+    """Robots' arm lengths by which a run was trained; {} of an older run, whose are measured again."""
+    return state["card"].get("arm_lengths_m", {})
 
 
 def output_unit(card):
@@ -469,7 +476,7 @@ def heat_loss(heat, place, truth):
 
 def train_joint(args):
     state = kept_state(args)
-    samples, numbers, held_out, validation, card = load_samples(args)
+    samples, numbers, held_out, validation, card = load_samples(args, state)
     numbers, validation = (
         chosen[part.has_robot[chosen] & (part.coverage[chosen] >= args.min_coverage)]
         for part, chosen in ((samples, numbers), (held_out, validation)))
@@ -483,7 +490,8 @@ def train_joint(args):
         # A recording may have grown since: what is resumed keeps its unit.
         unit = output_unit(state["card"]) if state else Standardised.of(samples.joints[numbers])
     card |= {"family": args.family, "samples": len(numbers), "camera": args.camera, "overlay": rule, "zoom": view, "min_coverage": args.min_coverage,
-             "estimated_masks": args.estimated_masks, "estimated_after": args.estimated_after, **unit.card()}
+             "estimated_masks": args.estimated_masks, "estimated_after": args.estimated_after,
+             "arm_lengths_m": samples.arm_lengths, **unit.card()}
     network = initialise(Network(layers, JOINT_INPUT, normalise=args.normalise))
     if args.family == "context":
         card |= {"heat_weight": args.heat_weight}
