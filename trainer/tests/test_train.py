@@ -405,12 +405,30 @@ def test_one_command_trains_two_robots_and_goes_on(recording, tmp_path, capsys):
     assert (tmp_path / "out" / "mask" / "log.csv").read_text() == before
     with pytest.raises(SystemExit, match="is of ur10"):
         main([*command[:2], str(recording), "--validation", str(other), *command[4:]])
+    third = tmp_path / "third"
+    shutil.copytree(other, third)
     with pytest.raises(SystemExit, match="none of ur5"):
-        main([*command, "--validation", str(other)])
+        main([*command, "--validation", str(third)])
+
+
+def test_no_recording_is_trained_and_validated_on(recording, tmp_path):
+    same, other = tmp_path / "same", tmp_path / "other"
+    same.symlink_to(recording)
+    shutil.copytree(recording, other)
+    for command in ("train", "train-mask", "train-joint"):
+        words = [command, "--recording", str(recording), "--out", str(tmp_path / "out"), "--cache", str(tmp_path / "cache"),
+                 "--validation"]
+        with pytest.raises(SystemExit, match=f"{recording}: expected recordings of their own to validate on"):
+            main([*words, str(other), str(same)])
+    assert not (tmp_path / "out").exists()
+    data.refuse_common([recording], [other])
+    data.refuse_common([recording], None)
 
 
 def test_a_small_validation_recording_is_chosen_on_and_reported_on_by_halves(recording, tmp_path):
-    args = SimpleNamespace(recording=[recording], validation=[recording], family="context", negatives=None, minutes=1.0, seed=7,
+    other = tmp_path / "other"
+    shutil.copytree(recording, other)
+    args = SimpleNamespace(recording=[recording], validation=[other], family="context", negatives=None, minutes=1.0, seed=7,
                            cache="c", dtype="f16", out=str(tmp_path / "out"))
     commands = pipeline.steps(args)
     assert [words[0] for words in commands] == ["train-mask", "train-joint", "export"]

@@ -282,6 +282,13 @@ def is_test(ids):
     return (z ^ (z >> np.uint64(31))) % np.uint64(5) == 0
 
 
+def refuse_common(recordings, validation):
+    """What is validated on is not trained on."""
+    common = {Path(folder).resolve() for folder in recordings} & {Path(folder).resolve() for folder in validation or []}
+    if common:
+        raise RecordingError(f"{min(common)}: expected recordings of their own to validate on, found one that is trained on")
+
+
 def split(samples):
     """(training, test) numbers."""
     test = is_test(samples.ids)

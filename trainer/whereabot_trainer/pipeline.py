@@ -16,6 +16,7 @@ VALIDATION_SAMPLES = 100
 
 def steps(args):
     """The commands, as lists of words, for recordings of one robot or of several."""
+    data.refuse_common(args.recording, args.validation)
     by_robot, fixed = {}, True
     for folder in args.recording:
         header = data.read_header(folder)

@@ -238,6 +238,7 @@ def _drop_rows_after(path, iteration):
 def load_samples(args, state):
     """(training samples, their numbers, validation samples, their numbers, the card's account of both). Arms are as long as in
     the `state` that is gone on from."""
+    data.refuse_common(args.recording, args.validation)
     samples = data.Samples(args.recording, args.cache, kept_arm_lengths(state) if state else None)
     if args.device != "cpu":
         samples.keep(args.device)
