@@ -1,4 +1,4 @@
-"""A small recording drawn here: six joints in space as coloured discs joined by a line, on a noisy background."""
+"""A small recording drawn here: the joints of a UR5 as coloured discs joined by a line, on a noisy background."""
 
 import json
 import math
@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw
 
+from arms import BODY, arms
 from whereabot_trainer.networks import JOINTS
 
 COLOURS = [(220, 40, 40), (40, 200, 60), (60, 80, 230), (230, 210, 50), (210, 60, 210), (60, 210, 220)]
@@ -19,7 +20,7 @@ def draw_recording(folder, count, seed=0):
     folder.joinpath("recording.json").write_text(json.dumps({
         "format": "whereabot-recording", "version": 1, "robot": "ur5", "joints": JOINTS, "width": 512, "height": 424,
         "frame": "camera_optical", "source": {"kind": "synthetic", "seed": seed, "protocol": "free_camera"}}))
-    lines = []
+    lines, joints = [], arms(BODY, count, seed).numpy()
     for number in range(count):
         picture = Image.fromarray(
             np.kron(rng.integers(60, 160, (53, 64, 3), np.uint8), np.ones((8, 8, 1), np.uint8)))
@@ -27,17 +28,14 @@ def draw_recording(folder, count, seed=0):
         sample = {"id": number, "image": f"image/{number:06}.jpg", "mask": f"mask/{number:06}.png",
                   "intrinsics": {"fx": 365, "fy": 365, "cx": 255.5, "cy": 211.5}}
         if number % 10 != 9:
-            points = [np.array([*rng.uniform(-0.25, 0.25, 2), rng.uniform(1.2, 2.0)])]
-            for _ in JOINTS[1:]:
-                step = rng.normal(size=3)
-                points.append(points[-1] + 0.2 * step / np.linalg.norm(step))
+            points = joints[number]
             pixels = [(365 * x / z + 255.5, 365 * y / z + 211.5) for x, y, z in points]
             for canvas, fills in ((ImageDraw.Draw(picture), COLOURS), (ImageDraw.Draw(mask), [255] * 6)):
-                canvas.line(pixels, fill=fills[0], width=14)
+                canvas.line(pixels, fill=fills[0], width=24)
                 for (u, v), (_, _, z), fill in zip(pixels, points, fills, strict=True):
                     radius = 365 * 0.06 / z
                     canvas.ellipse([u - radius, v - radius, u + radius, v + radius], fill=fill)
-            sample |= {"joints_m": np.array(points).tolist(), "joints_px": pixels,
+            sample |= {"joints_m": points.tolist(), "joints_px": pixels,
                        "joint_angles_rad": [0.0] * 6, "camera_from_base": np.eye(4).ravel().tolist()}
         sample["coverage"] = float((np.asarray(mask) > 0).mean())
         picture.save(folder / sample["image"], quality=92, subsampling=0)
