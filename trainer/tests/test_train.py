@@ -1,6 +1,7 @@
 import csv
 import json
 import math
+import re
 import shutil
 import subprocess
 import sys
@@ -11,6 +12,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from arms import BODY
+from conftest import draw_recording
 from whereabot_trainer import data, evaluate, export, golden, losses, pipeline
 from whereabot_trainer.__main__ import main
 from whereabot_trainer.export import SURE_THRESHOLDS, choose_presence
@@ -438,6 +441,57 @@ def test_a_small_validation_recording_is_chosen_on_and_reported_on_by_halves(rec
     for words in commands:
         assert words[words.index("--validation-samples") + 1] == "20"
         assert words[words.index("--seed") + 1] == "7"
+
+
+def test_what_robots_share_is_chosen_on_as_many_samples_of_each(recording, tmp_path, monkeypatch):
+    folders = {}
+    for robot in ("ur5", "ur10"):
+        folders[robot] = [tmp_path / f"{robot}-{part}" for part in ("training", "validation")]
+        for folder in folders[robot]:
+            shutil.copytree(recording, folder)
+            header = json.loads((folder / "recording.json").read_text())
+            (folder / "recording.json").write_text(json.dumps(header | {"robot": robot}))
+
+    def counts(family, robots=("ur5", "ur10")):
+        args = SimpleNamespace(
+            recording=[folders[robot][0] for robot in robots], validation=[folders[robot][1] for robot in robots],
+            family=family, negatives=None, minutes=1.0, seed=1, cache="c", dtype="f16", out=str(tmp_path / "out"))
+        return [(words[0], int(words[words.index("--validation-samples") + 1])) for words in pipeline.steps(args)]
+
+    monkeypatch.setattr(pipeline, "VALIDATION_SAMPLES", 15)
+    own = [("train-joint", 15)] * 2
+    assert counts("context") == [("train-mask", 30), ("train-joint", 30), *own, *[("export", 30)] * 2]
+    assert {count for _, count in counts("paper") + counts("context", ["ur10"])} == {15}
+    # Half of the samples are reported on.
+    monkeypatch.setattr(pipeline, "VALIDATION_SAMPLES", 35)
+    assert counts("context")[0] == ("train-mask", 40)
+
+
+def test_export_fits_an_arm_and_says_when_it_does_not(train, tmp_path, capsys):
+    mask = train("train-mask", "mask", "--iterations", "1", "--crop", "32", "24", "--validation-samples", "4")
+    joint = train("train-joint", "joint", "--iterations", "1", "--pool", "4", "--validation-samples", "4")
+    validation, bent, out = tmp_path / "validation", tmp_path / "bent", tmp_path / "model.safetensors"
+    draw_recording(validation, 44, seed=1)
+    shutil.copytree(validation, bent)
+    samples = [json.loads(line) for line in (bent / "samples.jsonl").read_text().splitlines()]
+    for sample in samples:
+        if "joints_m" in sample:
+            sample["joints_m"][5][0] += 0.02
+    (bent / "samples.jsonl").write_text("".join(json.dumps(sample) + "\n" for sample in samples))
+
+    def export(folder, count, *flags):
+        main(["export", "--mask", str(mask), "--joint", str(joint), "--validation", str(folder), "--cache", str(tmp_path / "cache"),
+              "--validation-samples", str(count), "--out", str(out), *flags])
+        description = read_model(out)[2]
+        assert description["card"]["fit"] == ("arm" in description)
+        return description, capsys.readouterr().out
+
+    description, said = export(validation, 38)
+    assert description["arm"]["bodies"] == [pytest.approx(BODY, abs=1e-4)] and "no kinematic fit" not in said
+    for folder, count, flags, why in ((validation, 38, ["--no-fit"], "--no-fit"), (validation, 12, [], r"\d+ of 30 samples with a ur5"),
+                                      (bent, 38, [], "joints are not those")):
+        description, said = export(folder, count, *flags)
+        assert "arm" not in description and re.search(f"^no kinematic fit: {why}", said, re.MULTILINE)
 
 
 def test_the_recordings_tell_whether_the_camera_stands_still(recording, tmp_path):

@@ -106,11 +106,18 @@ def export_runs(args):
 
     # How the joint network errs is measured where presence is chosen, on this robot.
     learned = chosen[own[chosen] & seen[chosen]]
-    fitted_arm = None
-    if not args.no_fit and len(learned) >= LEAST_LEARNED:
+    fitted_arm, unfitted = None, ""
+    if args.no_fit:
+        unfitted = "--no-fit"
+    elif len(learned) < LEAST_LEARNED:
+        unfitted = (f"{len(learned)} of {LEAST_LEARNED} samples with a {robot} among the {len(chosen)} chosen on:"
+                    " give more, or a larger --validation-samples")
+    else:
         estimates = evaluate.estimate_joints(
             joint, evaluate.identity_metres, samples, learned, estimated, rules, args.device)
         fitted_arm = kinematic_fit.arm_of(estimates.numpy(), samples.joints[learned])
+        if fitted_arm is None:
+            unfitted = "joints are not those of an arm of Universal Robots' kind"
 
     shown = reported[seen[reported]]
     measured = evaluate.score_mask(mask, samples, reported, args.device)
@@ -133,7 +140,7 @@ def export_runs(args):
         "task": "mask and joints (metres, camera optical frame) of one robot arm in one colour image",
         "data": {"training": joint_state["card"]["training_recordings"], "validation": samples.sources,
                  "protocol": joint_state["card"]["protocol"], "note": args.note},
-        "arm_length_m": arm,
+        "arm_length_m": arm, "fit": fitted_arm is not None,
         "mask_training": mask_card["mask_training"] | mask_mean, "joint_training": _training(joint_state) | joint_mean,
         "calibration": mask_card["calibration"], "figures": figures,
         "curves": {"mask_accuracy": mask_card["curves"]["mask_accuracy"], **_curves(args.joint[-1], JOINT_CURVES)}, "trainer": f"whereabot-trainer {__version__}, torch {torch.__version__.split('+')[0]}",
@@ -144,6 +151,8 @@ def export_runs(args):
         arm=fitted_arm, presence={"mask_threshold": 0.5, "sure_threshold": sure, "min_sure": least}, card=card)
     write_model(args.out, mask, joint, description, args.dtype)
     print(json.dumps({"chosen": description["presence"], "figures": figures}, indent=1))
+    if unfitted:
+        print(f"no kinematic fit: {unfitted}")
     print(f"{args.out}: {os.path.getsize(args.out) / 1e6:.2f} MB")
 
 

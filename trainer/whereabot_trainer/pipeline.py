@@ -44,7 +44,9 @@ def steps(args):
             return []
         # What export reports on is not what it chooses on.
         half = sum(len(data.read_samples(folder)) for folder in held_out) // 2
-        return ["--validation", *held_out, "--validation-samples", str(max(1, min(VALIDATION_SAMPLES, half)))]
+        # What robots share is chosen on samples of all of them, the kinematic fit on each one's own.
+        count = max(1, min(VALIDATION_SAMPLES * len(robots), half))
+        return ["--validation", *held_out, "--validation-samples", str(count)]
 
     def step(command, run, robots, minutes, *flags):
         resume = ["--resume"] if (out / run / "last.pt").exists() else []
