@@ -360,7 +360,8 @@ def train_mask(args):
     def batch_loss(images, masks):
         return losses.mask_loss(network(images), masks, w_fg, w_bg)
 
-    # What is reported on is not calibrated on: with a random split, the training samples are.
+    # With recordings of their own to validate on, the log's IoU is at the threshold that suits the very samples it is measured
+    # on; what export reports on is not chosen on. With a random split, training samples tell the threshold.
     some = np.sort(np.random.default_rng(args.seed).permutation(numbers)[: args.validation_samples])
     calibration = (held_out, validation) if args.validation else (samples, some)
 
