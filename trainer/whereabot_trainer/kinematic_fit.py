@@ -61,8 +61,6 @@ def arm_of(estimates, truths):
     if found is None:
         return None
     seen = _view(torch.from_numpy(estimates).double())
-    if seen is None:
-        return None
     errors = _errors(torch.from_numpy(truths).double(), *seen).numpy()
     return {"bodies": found, "across": _whitening(errors[..., :3], 2), "along": _whitening(errors[..., 3:], 1)}
 
