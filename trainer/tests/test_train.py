@@ -423,7 +423,7 @@ def test_no_recording_is_trained_and_validated_on(recording, tmp_path):
     shutil.copytree(recording, other)
     for command in ("train", "train-mask", "train-joint"):
         words = [command, "--recording", str(recording), "--out", str(tmp_path / "out"), "--cache", str(tmp_path / "cache"),
-                 "--validation"]
+                 "--minutes", "0.001", "--validation"]
         with pytest.raises(SystemExit, match=f"{recording}: expected recordings of their own to validate on"):
             main([*words, str(other), str(same)])
     assert not (tmp_path / "out").exists()
