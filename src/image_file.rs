@@ -1,7 +1,7 @@
 //! Image files, as cameras leave them.
 
-use std::io::{self, Cursor};
-use std::path::{Path, PathBuf};
+use std::io::Cursor;
+use std::path::Path;
 
 use image::error::{DecodingError, ImageFormatHint};
 use image::{DynamicImage, ImageError, ImageFormat, ImageReader};
@@ -41,7 +41,7 @@ fn decoder(path: &Path) -> Result<impl image::ImageDecoder, ImageError> {
 /// # Errors
 /// A folder that cannot be read.
 #[cfg(feature = "live")]
-pub(crate) fn in_folder(folder: &Path) -> io::Result<Vec<PathBuf>> {
+pub(crate) fn in_folder(folder: &Path) -> std::io::Result<Vec<std::path::PathBuf>> {
     let mut images = Vec::new();
     for entry in std::fs::read_dir(folder)? {
         let path = entry?.path();
