@@ -48,8 +48,8 @@ pub struct Report {
 /// Why a pose may not be what its deviation says.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Doubt {
-    /// From so many poses.
-    Poses(usize),
+    /// Too few poses of the robot.
+    Poses,
     /// Residuals are so many times larger than the networks' errors.
     Scale(f64),
     /// Only so many of the joints agree.
@@ -68,7 +68,7 @@ impl Doubt {
     pub fn of(found: &Registration, poses: usize) -> Vec<Self> {
         let share = found.inlier_share();
         let doubts = [
-            (poses < ENOUGH_POSES, Self::Poses(poses)),
+            (poses < ENOUGH_POSES, Self::Poses),
             (found.scale > MOST_SCALE, Self::Scale(found.scale)),
             (share < LEAST_SHARE, Self::Share(share)),
         ];
@@ -81,7 +81,7 @@ impl fmt::Display for Doubt {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let theirs = "do the joint angles and the URDF belong to these frames?";
         match self {
-            Self::Poses(_) => write!(
+            Self::Poses => write!(
                 f,
                 "fewer than {ENOUGH_POSES} poses: joints of a pose agree with each other however far they are off \
                  together, and the deviations know nothing of that"
