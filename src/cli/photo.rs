@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{Cursor, Read};
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, anyhow, bail, ensure};
 use exif::{In, Tag};
 use image::{DynamicImage, ImageDecoder, ImageReader, Limits, RgbaImage};
 
@@ -57,7 +57,8 @@ pub fn read(path: &Path) -> anyhow::Result<Photo> {
         width > 0 && height > 0,
         "expected an image, found no pixels"
     );
-    image_file::ensure_complete(format, &bytes).context("cannot be decoded")?;
+    // Its message holds its cause's.
+    image_file::ensure_complete(format, &bytes).map_err(|error| anyhow!("{error}"))?;
 
     // Broken metadata is no reason to refuse a picture.
     let focal_35mm = decoder
