@@ -1,5 +1,5 @@
-// The camera that the joint network looks through, one an image of the batch: where the canonical camera is, turned to the
-// robot, zoomed in on it. Stands in front of the `zoom_*` kernels.
+// A camera that looks closer, one an image of the batch: where the canonical camera is, turned to the robot, zoomed in on
+// it. Stands in front of the `zoom_*` kernels.
 struct Gaze {
     // Rows of the rotation from the canonical camera's frame to this one's; beside the first, the zoom.
     right: vec4<f32>,
@@ -16,4 +16,40 @@ override CY: f32;
 // What lies in the direction `seen`, in the canonical camera's frame.
 fn turned_back(gaze: Gaze, seen: vec3<f32>) -> vec3<f32> {
     return gaze.right.xyz * seen.x + gaze.down.xyz * seen.y + gaze.ahead.xyz * seen.z;
+}
+
+// What lies in the direction `ray` of the canonical camera's frame, in this one's.
+fn turned(gaze: Gaze, ray: vec3<f32>) -> vec3<f32> {
+    return vec3(dot(gaze.right.xyz, ray), dot(gaze.down.xyz, ray), dot(gaze.ahead.xyz, ray));
+}
+
+// Four texels of a plane, and how heavy each is.
+struct Sample {
+    low: vec2<u32>,
+    high: vec2<u32>,
+    weights: vec4<f32>,
+}
+
+// What the canonical camera, or one zoomed in by `zoom`, has in the direction `ray`, of a plane of `size`: bilinear. What
+// lies beyond the border or behind the camera weighs nothing.
+fn sample_of(ray: vec3<f32>, zoom: f32, size: vec2<f32>) -> Sample {
+    let at = ray.xy / max(ray.z, 1e-3) * (vec2(FX, FY) * zoom) + vec2(CX, CY);
+    if ray.z <= 1e-3 || any(at <= vec2(-1.0)) || any(at >= size) {
+        return Sample(vec2(0u), vec2(0u), vec4(0.0));
+    }
+    let corner = floor(at);
+    let part = at - corner;
+    let before = select(vec2(0.0), 1.0 - part, corner >= vec2(0.0));
+    let behind = select(vec2(0.0), part, corner + 1.0 < size);
+    return Sample(
+        vec2<u32>(max(corner, vec2(0.0))),
+        vec2<u32>(min(corner + 1.0, size - 1.0)),
+        vec4(before.x, behind.x, before.x, behind.x) * vec4(before.yy, behind.yy),
+    );
+}
+
+// Where pixel (x, y) of this camera looks, in the canonical camera's frame.
+fn canonical_ray(gaze: Gaze, x: u32, y: u32) -> vec3<f32> {
+    let pixel = vec2(f32(x), f32(y));
+    return turned_back(gaze, vec3((pixel - vec2(CX, CY)) / (vec2(FX, FY) * gaze.right.w), 1.0));
 }

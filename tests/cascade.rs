@@ -18,12 +18,15 @@ const ALL: Output = Output {
     mask_only: false,
 };
 
-/// A random model that finds a robot in everything, so that there are joints to compare.
-fn model(seed: u64, zoom: bool) -> Model {
+/// The keys of a description that turn a network's camera.
+const LOOKS: [&str; 2] = ["second_look", "zoom"];
+
+/// A random model that finds a robot in everything, so that there are joints to compare; with these [`LOOKS`].
+fn model(seed: u64, looks: &[&str]) -> Model {
     let mut description = description(256, 212, 32);
     description["presence"]["min_sure"] = 0.0.into();
-    if zoom {
-        description["zoom"] = zoomed();
+    for &look in looks {
+        description[look] = zoomed();
     }
     Model::from_bytes(&model_file(&description, seed), "random").unwrap()
 }
@@ -57,13 +60,14 @@ fn mask(estimate: &Estimate) -> &[f32] {
 
 #[test]
 fn gpu_and_reference_agree() {
-    for (seed, width, height, zoom) in [
-        (1, 512, 424, false),
-        (2, 640, 480, false),
-        (3, 300, 700, false),
-        (3, 640, 480, true),
+    for (seed, width, height, looks) in [
+        (1, 512, 424, &[][..]),
+        (2, 640, 480, &[]),
+        (3, 300, 700, &[]),
+        (3, 640, 480, &["zoom"]),
+        (2, 640, 480, &LOOKS),
     ] {
-        let model = model(seed, zoom);
+        let model = model(seed, looks);
         let image = picture(width, height, seed);
         let camera = Camera::from_hfov(width, height, 70_f64.to_radians());
         let gpu = Locator::on_gpu(device(), &model, Precision::F32)
@@ -82,7 +86,7 @@ fn gpu_and_reference_agree() {
 
 #[test]
 fn another_picture_is_noticed() {
-    let model = model(1, false);
+    let model = model(1, &[]);
     let camera = Camera::from_hfov(512, 424, 70_f64.to_radians());
     let mut locator = Locator::on_gpu(device(), &model, Precision::F32).unwrap();
     let first = locator.locate(&picture(512, 424, 1), &camera, ALL).unwrap();
@@ -96,8 +100,10 @@ fn another_picture_is_noticed() {
 #[test]
 fn a_batch_gives_what_single_images_give() {
     let mut description = description(48, 40, 5);
-    for zoom in [serde_json::Value::Null, zoomed()] {
-        description["zoom"] = zoom;
+    for looks in [serde_json::Value::Null, zoomed()] {
+        for look in LOOKS {
+            description[look] = looks.clone();
+        }
         let model = Model::from_bytes(&model_file(&description, 4), "random").unwrap();
         gives_what_single_images_give(&model);
     }
@@ -262,13 +268,14 @@ fn a_mask_that_is_no_number_is_not_a_robot() {
 }
 
 #[test]
-fn a_zoomed_joint_network_sees_something_else() {
+fn a_zoomed_network_sees_something_else() {
     let image = picture(512, 424, 3);
     let camera = Camera::from_hfov(512, 424, 70_f64.to_radians());
-    let [plain, zoomed] = [false, true].map(|zoom| {
-        let mut locator = Locator::on_gpu(device(), &model(3, zoom), Precision::F32).unwrap();
+    let [plain, twice, zoomed] = [&[][..], &["second_look"], &["zoom"]].map(|looks| {
+        let mut locator = Locator::on_gpu(device(), &model(3, looks), Precision::F32).unwrap();
         locator.locate(&image, &camera, ALL).unwrap()
     });
+    assert!(difference(mask(&plain), mask(&twice)).unwrap() > 1e-2);
     assert_eq!(mask(&plain), mask(&zoomed));
     assert!(difference(&joints(&plain), &joints(&zoomed)).unwrap() > 1e-3);
 }

@@ -197,6 +197,10 @@ fn descriptions_that_mean_something_else_are_refused() {
             &["zoom", "least 5", "most 4"],
         ),
         (
+            |d| d["second_look"] = json!({"spread": 5, "least": 1, "most": 200}),
+            &["second_look", "0.01", "most 200"],
+        ),
+        (
             |d| d["zoom"] = json!({"spread": 5, "least": 0.5}),
             &["most"],
         ),

@@ -19,7 +19,7 @@ use Layout::{Buffer, HalfBuffer};
 
 /// What the library composes from the files in `shaders/`, and the constants that these want in their text:
 /// a file that nobody lists is not tested. Some have no layout: they bind their textures themselves, or draw.
-const KERNELS: [Kernel; 30] = [
+const KERNELS: [Kernel; 32] = [
     (&["back_project"], &Layout::ALL, &[]),
     (&["concat"], &Layout::ALL, &[]),
     (
@@ -127,7 +127,9 @@ const KERNELS: [Kernel; 30] = [
         &Layout::ALL,
         &[],
     ),
+    (&["zoom_camera", "zoom_image"], &Layout::ALL, &[]),
     (&["zoom_camera", "zoom_joints"], &Layout::ALL, &[]),
+    (&["zoom_camera", "zoom_mask"], &Layout::ALL, &[]),
 ];
 
 type Kernel = (

@@ -1,4 +1,4 @@
-//! The kernels that turn and zoom the joint network's camera against the reference.
+//! The kernels that turn and zoom a network's camera against the reference.
 #![allow(clippy::unwrap_used, missing_docs)]
 
 mod common;
@@ -55,33 +55,42 @@ fn masks(shape: Shape, batch: usize, seed: u64) -> Vec<f32> {
         .collect()
 }
 
-/// What the joint network is shown, and the joints that it sees `seen` in the canonical camera's frame.
-fn run(
-    image: &[f32],
-    mask: &[f32],
-    seen: &[f32],
-    shape: Shape,
-    rule: Overlay,
-) -> (Vec<f32>, Vec<f32>) {
+/// By name: what the cameras see of the image; what they see of the mask, and the mask beyond; the joint network's input; the joints
+/// that it sees in the canonical camera's frame.
+type Outputs = [(&'static str, Vec<f32>); 4];
+
+/// The mask that the cameras see: the image's first channel.
+fn closer(image: &[f32], shape: Shape) -> Vec<f32> {
+    let plane = shape.height * shape.width;
+    let images = image.chunks_exact(shape.len());
+    images.flat_map(|image| image[..plane].to_vec()).collect()
+}
+
+fn run(image: &[f32], mask: &[f32], seen: &[f32], shape: Shape, rule: Overlay) -> Outputs {
     let device = device();
     let batch = image.len() / shape.len();
     let joint_shape = Shape::new(3 * JOINTS, 1, 1);
+    let one = Shape::new(1, shape.height, shape.width);
+    let empty = |what, shape| Tensor::new(&device, what, shape, batch).unwrap();
     let tensor = |what, shape, values: &[f32]| {
-        let tensor = Tensor::new(&device, what, shape, batch).unwrap();
+        let tensor = empty(what, shape);
         tensor.write(&device, values).unwrap();
         tensor
     };
-    let mask = tensor("mask", Shape::new(1, shape.height, shape.width), mask);
+    let mask = tensor("mask", one, mask);
+    let closer = tensor("closer", one, &closer(image, shape));
     let (image, seen) = (
         tensor("image", shape, image),
         tensor("seen", joint_shape, seen),
     );
-    let overlay = Tensor::new(&device, "overlay", shape, batch).unwrap();
-    let joints = Tensor::new(&device, "joints", joint_shape, batch).unwrap();
+    let (zoomed, merged) = (empty("zoomed", shape), empty("merged", one));
+    let (overlay, joints) = (empty("overlay", shape), empty("joints", joint_shape));
     let steps = device.scoped(|| {
         let gazes = Gazes::new(&device, camera(shape), batch)?;
         Ok([
             gazes.zoom(&device, &mask, ZOOM, rule)?,
+            gazes.zoom_image(&device, &image, &zoomed)?,
+            gazes.zoom_mask(&device, &closer, &mask, &merged)?,
             gazes.zoom_overlay(&device, &image, &mask, &overlay, rule)?,
             gazes.zoom_joints(&device, &seen, &joints)?,
         ])
@@ -89,34 +98,51 @@ fn run(
     for step in &steps.unwrap() {
         run_step(&device, step);
     }
-    (
-        overlay.read(&device).unwrap(),
-        joints.read(&device).unwrap(),
-    )
+    let outputs = [
+        ("image", zoomed),
+        ("mask", merged),
+        ("overlay", overlay),
+        ("joints", joints),
+    ];
+    outputs.map(|(name, tensor)| (name, tensor.read(&device).unwrap()))
 }
 
-fn expected(
-    image: &[f32],
-    mask: &[f32],
-    seen: &[f32],
-    shape: Shape,
-    rule: Overlay,
-) -> (Vec<f32>, Vec<f32>) {
+fn expected(image: &[f32], mask: &[f32], seen: &[f32], shape: Shape, rule: Overlay) -> Outputs {
     let one = Shape::new(1, shape.height, shape.width);
     let camera = camera(shape);
-    let (mut overlays, mut joints) = (Vec::new(), Vec::new());
-    for ((image, mask), seen) in image
+    let closer = closer(image, shape);
+    let mut outputs = ["image", "mask", "overlay", "joints"].map(|name| (name, Vec::new()));
+    for (index, ((image, mask), seen)) in image
         .chunks_exact(shape.len())
         .zip(mask.chunks_exact(one.len()))
         .zip(seen.chunks_exact(3 * JOINTS))
+        .enumerate()
     {
-        let image = reference::Tensor::new(shape, image.to_vec()).unwrap();
-        let mask = reference::Tensor::new(one, mask.to_vec()).unwrap();
+        let tensor =
+            |shape, values: &[f32]| reference::Tensor::new(shape, values.to_vec()).unwrap();
+        let closer = tensor(one, &closer[index * one.len()..][..one.len()]);
+        let (image, mask) = (tensor(shape, image), tensor(one, mask));
         let gaze = reference::zoom(&mask, rule, &camera, ZOOM);
-        overlays.extend(reference::zoom_overlay(&image, &mask, rule, &camera, &gaze).data());
-        joints.extend(reference::zoom_joints(seen, &gaze));
+        outputs[0]
+            .1
+            .extend(reference::zoom_image(&image, &camera, &gaze).data());
+        outputs[1]
+            .1
+            .extend(reference::zoom_mask(&closer, &mask, &camera, &gaze).data());
+        outputs[2]
+            .1
+            .extend(reference::zoom_overlay(&image, &mask, rule, &camera, &gaze).data());
+        outputs[3].1.extend(reference::zoom_joints(seen, &gaze));
     }
-    (overlays, joints)
+    outputs
+}
+
+/// Of each output, by its name.
+fn differences(found: &Outputs, expected: &Outputs) -> Vec<(&'static str, f32)> {
+    let pairs = found.iter().zip(expected);
+    pairs
+        .map(|((name, found), (_, expected))| (*name, difference(found, expected).unwrap()))
+        .collect()
 }
 
 proptest! {
@@ -133,10 +159,11 @@ proptest! {
         let image: Vec<f32> = noise(batch * shape.len(), seed.into()).iter().map(|v| 0.1 * v).collect();
         let mask = masks(shape, batch, seed.into());
         let seen = noise(batch * 3 * JOINTS, u64::from(seed) + 2);
-        let (overlay, joints) = run(&image, &mask, &seen, shape, RAMP);
-        let (expected_overlay, expected_joints) = expected(&image, &mask, &seen, shape, RAMP);
-        prop_assert!(difference(&joints, &expected_joints).unwrap() <= 1e-4);
-        prop_assert!(difference(&overlay, &expected_overlay).unwrap() <= 1e-4);
+        let found = run(&image, &mask, &seen, shape, RAMP);
+        let expected = expected(&image, &mask, &seen, shape, RAMP);
+        for (name, difference) in differences(&found, &expected) {
+            prop_assert!(difference <= 1e-4, "{name}: {difference}");
+        }
     }
 }
 
@@ -147,15 +174,15 @@ fn a_threshold_is_kept_to_but_for_pixels_next_to_it() {
     let mask = masks(shape, 2, 4);
     let seen = vec![0.0; 2 * 3 * JOINTS];
     let rule = Overlay::Threshold { threshold: 0.5 };
-    let (found, _) = run(&image, &mask, &seen, shape, rule);
-    let (expected, _) = expected(&image, &mask, &seen, shape, rule);
+    let [.., (_, found), _] = run(&image, &mask, &seen, shape, rule);
+    let [.., (_, expected), _] = expected(&image, &mask, &seen, shape, rule);
     let other = |(a, b): (&f32, &f32)| (a - b).abs() > 1e-3;
     let wrong = found.iter().zip(&expected).filter(|pair| other(*pair));
     let wrong = wrong.count();
     assert!(wrong <= 6, "{wrong} of {} values", found.len());
     // Negative control: the threshold matters to more than those.
     let lower = Overlay::Threshold { threshold: 0.4 };
-    let (lower, _) = run(&image, &mask, &seen, shape, lower);
+    let [.., (_, lower), _] = run(&image, &mask, &seen, shape, lower);
     assert!(
         lower
             .iter()
@@ -171,10 +198,27 @@ fn a_pixel_more_in_the_mask_is_noticed() {
     let shape = Shape::new(3, 20, 24);
     let (image, seen) = (noise(shape.len(), 1), noise(3 * JOINTS, 3));
     let mut mask = masks(shape, 1, 1);
-    let (overlay, joints) = run(&image, &mask, &seen, shape, RAMP);
+    let found = run(&image, &mask, &seen, shape, RAMP);
     let far = mask.iter().rposition(|p| *p < 0.25).unwrap();
     mask[far] = 0.9;
-    let (expected_overlay, expected_joints) = expected(&image, &mask, &seen, shape, RAMP);
-    assert!(difference(&joints, &expected_joints).unwrap() > 1e-3);
-    assert!(difference(&overlay, &expected_overlay).unwrap() > 1e-3);
+    let expected = expected(&image, &mask, &seen, shape, RAMP);
+    for (name, difference) in differences(&found, &expected) {
+        assert!(difference > 1e-3, "{name}: {difference}");
+    }
+}
+
+#[test]
+fn what_the_canonical_camera_sees_stays_as_it_is() {
+    let shape = Shape::new(3, 53, 64);
+    let (image, seen) = (noise(shape.len(), 1), noise(3 * JOINTS, 3));
+    let nothing = vec![0.0; shape.height * shape.width];
+    let [(_, zoomed), (_, merged), ..] = run(&image, &nothing, &seen, shape, RAMP);
+    assert_eq!(zoomed, image);
+    assert!(difference(&merged, &closer(&image, shape)).unwrap() <= 1e-4);
+    // Negative control: one pixel turns the camera.
+    let mut mask = nothing;
+    mask[70] = 0.9;
+    let [(_, zoomed), (_, merged), ..] = run(&image, &mask, &seen, shape, RAMP);
+    assert!(difference(&zoomed, &image).unwrap() > 0.1);
+    assert!(difference(&merged, &closer(&image, shape)).unwrap() > 0.1);
 }

@@ -25,12 +25,12 @@ def read_model(path):
 
 
 def networks_alone(path, copy):
-    """Copies a model file, but for what turns the joint network's camera and fits its joints to an arm: peers run the networks,
-    which cost the same."""
+    """Copies a model file, but for what makes the mask network look again, turns the joint network's camera and fits its joints to an
+    arm: peers run the networks, each once, which cost the same."""
     with safe_open(path, framework="numpy") as file:
         metadata, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}
     description = json.loads(metadata["whereabot"])
-    for part in ("zoom", "arm"):
+    for part in ("second_look", "zoom", "arm"):
         description.pop(part, None)
     save_file(tensors, copy, metadata | {"whereabot": json.dumps(description)})
 

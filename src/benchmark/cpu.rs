@@ -129,13 +129,26 @@ fn layer_times(
     let shape = model.mask_network.input();
     let image = reference::rectify(image, rectification, shape.height, shape.width);
     lap();
-    let mask = reference::run_each(&model.mask_network, &image, |_| lap())
-        .and_then(|mut outputs| outputs.pop())
-        .ok_or(LocateError::Shape("mask network"))?;
-    let presence = model.description.presence;
+    let description = &model.description;
+    let look = |image: &reference::Tensor, lap: &mut dyn FnMut()| {
+        reference::run_each(&model.mask_network, image, |_| lap())
+            .and_then(|mut outputs| outputs.pop())
+            .ok_or(LocateError::Shape("mask network"))
+    };
+    let mut mask = look(&image, &mut lap)?;
+    if let Some(rules) = description.second_look {
+        let camera = &description.camera;
+        let gaze = reference::zoom(&mask, description.overlay, camera, rules);
+        let seen = reference::zoom_image(&image, camera, &gaze);
+        lap();
+        let closer = look(&seen, &mut lap)?;
+        mask = reference::zoom_mask(&closer, &mask, camera, &gaze);
+        lap();
+    }
+    let presence = description.presence;
     reference::coverage(&mask, presence.mask_threshold, presence.sure_threshold);
     lap();
-    let (masked, gaze) = reference::joint_input(&image, &mask, &model.description);
+    let (masked, gaze) = reference::joint_input(&image, &mask, description);
     lap();
     let joints = reference::run_each(&model.joint_network, &masked, |_| lap())
         .and_then(|mut outputs| outputs.pop())
@@ -145,7 +158,7 @@ fn layer_times(
         joints = reference::zoom_joints(&joints, &gaze);
         lap();
     }
-    if let Some(arm) = &model.description.arm {
+    if let Some(arm) = &description.arm {
         reference::kinematic_fit(&joints, arm);
         lap();
     }
@@ -168,6 +181,11 @@ fn layer_works(model: &Model, batch: usize) -> Vec<LayerWork> {
     let pixels = IMAGE.0 as usize * IMAGE.1 as usize;
     let mut layers = vec![between("rectify", pixels + image.len())];
     layers.extend(network_works("mask", &model.mask_network, batch));
+    if model.description.second_look.is_some() {
+        layers.push(between("second.zoom_image", 2 * image.len() + mask.len()));
+        layers.extend(network_works("second", &model.mask_network, batch));
+        layers.push(between("second.zoom_mask", 3 * mask.len()));
+    }
     layers.push(between("coverage", mask.len()));
     let zooms = model.description.zoom.is_some();
     let name = if zooms { "zoom_overlay" } else { "overlay" };

@@ -245,8 +245,7 @@ fn run_reference(
     let description = &model.description;
     let shape = model.mask_network.input();
     let image = reference::rectify(image, rectification, shape.height, shape.width);
-    let mask =
-        reference::run(&model.mask_network, &image).ok_or(LocateError::Shape("mask network"))?;
+    let mask = reference::mask(model, &image).ok_or(LocateError::Shape("mask network"))?;
     let presence = description.presence;
     let coverage = reference::coverage(&mask, presence.mask_threshold, presence.sure_threshold);
     let joints = if output.mask_only {

@@ -46,7 +46,8 @@ fn card(model: &Model, file_size: usize) -> String {
         ("mask network", &model.mask_network),
         ("joint network", &model.joint_network),
     ];
-    let macs: u64 = networks.iter().map(|(_, network)| network.macs()).sum();
+    let looks = 1 + u64::from(description.second_look.is_some());
+    let macs = looks * model.mask_network.macs() + model.joint_network.macs();
     let parameters: usize = networks
         .iter()
         .map(|(_, network)| network.parameter_count())
@@ -60,13 +61,13 @@ fn card(model: &Model, file_size: usize) -> String {
             format!("colour that fades in from a mask of {low} to one of {high}")
         }
     };
-    let zoom = match description.zoom {
+    let [second_look, zoom] = [description.second_look, description.zoom].map(|zoom| match zoom {
         None => "none".to_owned(),
         Some(zoom) => format!(
             "{} standard deviations of the mask across the image, {} to {} times",
             zoom.spread, zoom.least, zoom.most
         ),
-    };
+    });
     let arm = match &description.arm {
         None => "joints stay where the network puts them".to_owned(),
         Some(arm) => {
@@ -88,6 +89,7 @@ fn card(model: &Model, file_size: usize) -> String {
          joints      {}\n\
          input       {} x {} pixels, fx {} fy {} cx {} cy {}\n\
          overlay     {overlay}\n\
+         second look {second_look}\n\
          zoom        {zoom}\n\
          arm         {arm}\n\
          mask        probability of at least {}\n\

@@ -23,6 +23,7 @@ mod pipelines;
 mod plan;
 mod probe;
 mod rectify;
+mod second_look;
 mod sigmoid;
 mod soft_argmax2d;
 mod source;

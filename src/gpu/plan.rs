@@ -4,6 +4,7 @@ use super::coverage::{Totals, coverage};
 use super::kinematic_fit::kinematic_fit;
 use super::overlay::overlay;
 use super::rectify::Rectify;
+use super::second_look::SecondLook;
 use super::source::Planes;
 use super::step::Step;
 use super::tensor::{Tensor, staging_buffer, storage_buffer};
@@ -20,6 +21,7 @@ pub struct Plan {
     image: Tensor,
     rectify: Vec<Rectify>,
     mask: NetworkPlan,
+    second_look: Option<SecondLook>,
     coverage: Step,
     totals: wgpu::Buffer,
     /// How many frames ran to their end: a `u32`.
@@ -91,14 +93,23 @@ impl Plan {
         device.scoped(|| {
             let image = NetworkPlan::input(device, layout, "image", &model.mask_network, batch)?;
             let rectify = (0..batch).map(|_| Rectify::new(device)).collect();
+            let looked_at = match description.second_look {
+                None => image.clone(),
+                Some(_) => NetworkPlan::input(device, layout, "look", &model.mask_network, batch)?,
+            };
             let mask = NetworkPlan::planned(
                 device,
                 "mask",
                 &model.mask_network,
-                &image,
+                &looked_at,
                 None,
                 &mut planned,
             )?;
+            let (rule, camera) = (description.overlay, description.camera);
+            let second_look = description.second_look.map(|zoom| {
+                SecondLook::new(device, &mask, (&image, &looked_at), camera, (zoom, rule))
+            });
+            let second_look = second_look.transpose()?;
             let masked =
                 NetworkPlan::input(device, layout, "overlay", &model.joint_network, batch)?;
             let joint = NetworkPlan::planned(
@@ -114,19 +125,18 @@ impl Plan {
                 "coverage: totals",
                 (batch * size_of::<Totals>()) as u64,
             )?;
-            let output = mask.output();
+            let output = mask_of(&mask, second_look.as_ref());
             let presence = description.presence;
             let thresholds = (presence.mask_threshold, presence.sure_threshold);
             let runs = storage_buffer(device, "coverage: runs", size_of::<u32>() as u64)?;
             let coverage = coverage(device, output, &totals, &runs, thresholds)?;
-            let rule = description.overlay;
             let seen = joint.output();
             let joints = || Tensor::in_layout(device, layout, "joints", seen.shape, batch, 0);
             let mut behind: Vec<Behind> = Vec::new();
             let overlay = match description.zoom {
                 None => vec![overlay(device, &image, output, &masked, rule)?],
                 Some(zoom) => {
-                    let gazes = Gazes::new(device, description.camera, batch)?;
+                    let gazes = Gazes::new(device, camera, batch)?;
                     let joints = joints()?;
                     let step = gazes.zoom_joints(device, seen, &joints)?;
                     behind.push(Behind { step, joints });
@@ -156,6 +166,7 @@ impl Plan {
                 results,
                 masks,
                 mask,
+                second_look,
                 joint,
                 behind,
             })
@@ -220,9 +231,9 @@ impl Plan {
         self.image.batch
     }
 
-    /// The mask network's output: probabilities `[1, height, width]`.
+    /// The mask network's answer, of both looks where it takes two: probabilities `[1, height, width]`.
     pub fn mask(&self) -> &Tensor {
-        self.mask.output()
+        mask_of(&self.mask, self.second_look.as_ref())
     }
 
     /// The joints in the canonical camera's frame: `[3 joints, 1, 1]`.
@@ -234,6 +245,14 @@ impl Plan {
     /// What there is to see in the masks: one [`Totals`] an image.
     pub(super) fn totals(&self) -> &wgpu::Buffer {
         &self.totals
+    }
+
+    /// The dispatches from images to masks.
+    fn mask_steps(&self) -> impl Iterator<Item = &Step> {
+        let look = self.second_look.as_ref();
+        let before = look.map(SecondLook::before);
+        let after = look.into_iter().flat_map(SecondLook::after);
+        before.into_iter().chain(self.mask.steps()).chain(after)
     }
 
     /// The dispatches from masks to joints.
@@ -248,7 +267,7 @@ impl Plan {
         self.rectify
             .iter()
             .filter_map(Rectify::step)
-            .chain(self.mask.steps())
+            .chain(self.mask_steps())
             .chain(
                 self.joint_steps()
                     .take(if with_joints { usize::MAX } else { 0 }),
@@ -338,17 +357,17 @@ impl Plan {
     /// A buffer for [`Self::copy_masks`], to be mapped.
     #[cfg(not(target_arch = "wasm32"))]
     pub(crate) fn masks_buffer(&self, device: &Device) -> wgpu::Buffer {
-        staging_buffer(device, self.mask.output().staging_size())
+        staging_buffer(device, self.mask().staging_size())
     }
 
     /// Records the copy of a frame's masks, for [`Self::put_masks`].
     pub(crate) fn copy_masks(&self, encoder: &mut wgpu::CommandEncoder, masks: &wgpu::Buffer) {
-        self.mask.output().copy_to(encoder, masks, 0);
+        self.mask().copy_to(encoder, masks, 0);
     }
 
     /// Puts what [`Self::copy_masks`] copied into `frames`.
     pub(crate) fn put_masks(&self, frames: &mut [Frame], bytes: &[u8]) {
-        let values = self.mask.output().values(bytes);
+        let values = self.mask().values(bytes);
         let plane = self.image.shape.height * self.image.shape.width;
         for (frame, mask) in frames.iter_mut().zip(values.chunks_exact(plane)) {
             frame.mask = mask.to_vec();
@@ -394,7 +413,7 @@ impl Plan {
         device: &Device,
         run: u32,
     ) -> Result<Option<Vec<f32>>, GpuError> {
-        let masks = self.mask.output();
+        let masks = self.mask();
         let (end, size) = (masks.staging_size(), self.runs.size());
         let staging = device.scoped(|| Ok(staging_buffer(device, end + size)))?;
         let mut encoder = device.wgpu().create_command_encoder(&Default::default());
@@ -449,7 +468,7 @@ impl Plan {
         device: &Device,
         masks: &[f32],
     ) -> Result<Vec<Vec<f32>>, GpuError> {
-        self.mask.output().write(device, masks)?;
+        self.mask().write(device, masks)?;
         let mut encoder = device.wgpu().create_command_encoder(&Default::default());
         let sources = self.rectify.iter().filter_map(Rectify::step);
         let steps = sources.chain(self.joint_steps()).chain([&self.coverage]);
@@ -469,6 +488,10 @@ impl Plan {
             .map(<[f32]>::to_vec)
             .collect()
     }
+}
+
+fn mask_of<'a>(network: &'a NetworkPlan, second_look: Option<&'a SecondLook>) -> &'a Tensor {
+    second_look.map_or(network.output(), SecondLook::mask)
 }
 
 /// Where image `index` of a batch is rectified, and how.

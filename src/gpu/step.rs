@@ -205,6 +205,14 @@ impl Step {
         )
     }
 
+    /// The same, for the layer `label`.
+    pub(super) fn labelled(&self, label: &str) -> Self {
+        Self {
+            label: label.to_owned(),
+            ..self.clone()
+        }
+    }
+
     /// The layer that it belongs to, as `network.layer`. A layer's steps follow each other.
     pub fn label(&self) -> &str {
         &self.label

@@ -1,6 +1,6 @@
 use super::overlay::share_constants;
 use super::step::{Step, StepDescriptor, Tensors, Work};
-use super::tensor::{Tensor, storage_buffer};
+use super::tensor::{Tensor, constant_buffer, storage_buffer};
 use super::{Device, GpuError};
 use crate::camera::Intrinsics;
 use crate::network::{Overlay, Zoom};
@@ -8,7 +8,7 @@ use crate::network::{Overlay, Zoom};
 /// Bytes of a camera, as `shaders/zoom_camera.wgsl` lays it out.
 const GAZE_SIZE: usize = 48;
 
-/// The joint network's cameras of a batch: turned to the robots and zoomed in on them, on the GPU.
+/// A network's cameras of a batch: turned to the robots and zoomed in on them, on the GPU.
 #[derive(Debug)]
 pub struct Gazes {
     buffer: wgpu::Buffer,
@@ -22,6 +22,22 @@ impl Gazes {
     /// More images than a buffer holds.
     pub fn new(device: &Device, canonical: Intrinsics, batch: usize) -> Result<Self, GpuError> {
         let buffer = storage_buffer(device, "zoom: cameras", (batch * GAZE_SIZE) as u64)?;
+        Ok(Self { buffer, canonical })
+    }
+
+    /// The `canonical` camera itself for all of `batch` images, as long as no [`Gazes::zoom`] turns them. Driver errors
+    /// reach the caller's [`Device::scoped`].
+    ///
+    /// # Errors
+    /// More images than a buffer holds.
+    pub fn canonical(
+        device: &Device,
+        canonical: Intrinsics,
+        batch: usize,
+    ) -> Result<Self, GpuError> {
+        // Rows of the rotation; beside the first, the zoom.
+        let gaze = [1., 0., 0., 1., 0., 1., 0., 0., 0., 0., 1., 0.];
+        let buffer = constant_buffer(device, "zoom: canonical", &gaze.repeat(batch))?;
         Ok(Self { buffer, canonical })
     }
 
@@ -55,6 +71,47 @@ impl Gazes {
                 ("MOST", f64::from(zoom.most)),
             ],
             mask.batch,
+        )
+    }
+
+    /// What they see of `image` (`shaders/zoom_image.wgsl`): four channels at most, to `output` of the same shape. To the
+    /// canonical camera, it stays as it is.
+    ///
+    /// # Errors
+    /// More pixels than a dispatch holds. Driver errors reach the caller's [`Device::scoped`].
+    pub fn zoom_image(
+        &self,
+        device: &Device,
+        image: &Tensor,
+        output: &Tensor,
+    ) -> Result<Step, GpuError> {
+        self.step(
+            device,
+            ("zoom_image", include_str!("../../shaders/zoom_image.wgsl")),
+            Tensors::from_to(image, output),
+            &[],
+            output.texels().div_ceil(64),
+        )
+    }
+
+    /// The canonical camera's mask (`shaders/zoom_mask.wgsl`): `closer`, what they see of it, as far as they see, and
+    /// `first` beyond; all `[1, height, width]`.
+    ///
+    /// # Errors
+    /// More pixels than a dispatch holds. Driver errors reach the caller's [`Device::scoped`].
+    pub fn zoom_mask(
+        &self,
+        device: &Device,
+        closer: &Tensor,
+        first: &Tensor,
+        output: &Tensor,
+    ) -> Result<Step, GpuError> {
+        self.step(
+            device,
+            ("zoom_mask", include_str!("../../shaders/zoom_mask.wgsl")),
+            Tensors::both_to(closer, first, output),
+            &[],
+            output.texels().div_ceil(64),
         )
     }
 

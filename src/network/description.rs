@@ -24,6 +24,9 @@ pub struct Description {
     pub mask_network: NetworkDescription,
     /// How mask and colour make the joint network's input.
     pub overlay: Overlay,
+    /// Where the mask network looks again, at what its first mask shows; without it, it looks once.
+    #[serde(default)]
+    pub second_look: Option<Zoom>,
     /// Where the joint network's camera looks; without it, it is the canonical camera.
     #[serde(default)]
     pub zoom: Option<Zoom>,
@@ -100,7 +103,7 @@ impl Overlay {
     }
 }
 
-/// How the joint network's camera turns to the robot: to the mean of the mask's pixels, zoomed so that so many of their
+/// How a network's camera turns to the robot: to the mean of the mask's pixels, zoomed so that so many of their
 /// standard deviations are as wide or as high as the image, whichever is the less zoom.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -205,19 +208,22 @@ impl Description {
                 }
             }
         }
-        if let Some(zoom) = self.zoom {
-            let Zoom {
+        for (key, zoom) in [("second_look", self.second_look), ("zoom", self.zoom)] {
+            let Some(Zoom {
                 spread,
                 least,
                 most,
-            } = zoom;
+            }) = zoom
+            else {
+                continue;
+            };
             if ![spread, least, most]
                 .iter()
                 .all(|v| (0.01..=100.0).contains(v))
                 || least > most
             {
                 return Err(format!(
-                    "zoom: expected numbers between 0.01 and 100, least not above most, found spread {spread}, least \
+                    "{key}: expected numbers between 0.01 and 100, least not above most, found spread {spread}, least \
                      {least}, most {most}"
                 ));
             }

@@ -1,5 +1,22 @@
-use super::{Gaze, Tensor, kinematic_fit, overlay, run, zoom, zoom_joints, zoom_overlay};
+use super::{
+    Gaze, Tensor, kinematic_fit, overlay, run, zoom, zoom_image, zoom_joints, zoom_mask,
+    zoom_overlay,
+};
 use crate::network::{Description, Model};
+
+/// The mask of the robot in `image`: the mask network's, of the second look too where `model` takes one. `None` where the
+/// image is not what the network takes.
+pub fn mask(model: &Model, image: &Tensor) -> Option<Tensor> {
+    let (network, description) = (&model.mask_network, &model.description);
+    let first = run(network, image)?;
+    let Some(rules) = description.second_look else {
+        return Some(first);
+    };
+    let camera = &description.camera;
+    let gaze = zoom(&first, description.overlay, camera, rules);
+    let closer = run(network, &zoom_image(image, camera, &gaze))?;
+    Some(zoom_mask(&closer, &first, camera, &gaze))
+}
 
 /// The joint network's input, and where it looks from unless that is the canonical camera: the overlay of `image` and
 /// `mask` that `description` asks for.

@@ -2,8 +2,7 @@ use super::{Tensor, overlay};
 use crate::camera::Intrinsics;
 use crate::network::{Overlay, Shape, Zoom};
 
-/// The camera that the joint network looks through: where the canonical camera is, turned to the robot, zoomed in on
-/// it.
+/// A camera that a network looks through: where the canonical camera is, turned to the robot, zoomed in on it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Gaze {
     /// Rows of the rotation from the canonical camera's frame to this one's.
@@ -19,6 +18,12 @@ impl Gaze {
         zoom: 1.0,
     };
 
+    /// What lies in the direction `ray` of the canonical camera's frame, in this one's.
+    fn turned(&self, ray: [f32; 3]) -> [f32; 3] {
+        let along = |axis: [f32; 3]| axis[0] * ray[0] + axis[1] * ray[1] + axis[2] * ray[2];
+        self.rotation.map(along)
+    }
+
     /// What lies in the direction `seen`, in the canonical camera's frame.
     fn turned_back(&self, seen: [f32; 3]) -> [f32; 3] {
         let [right, down, ahead] = self.rotation;
@@ -26,7 +31,7 @@ impl Gaze {
     }
 }
 
-/// Turns the joint network's camera to the pixels that the overlay's `rule` shows by `mask` `[1, height, width]`, each as
+/// Turns a network's camera to the pixels that the overlay's `rule` shows by `mask` `[1, height, width]`, each as
 /// heavy as it is shown: to their mean, so close that `spread` of their standard deviations are as wide or as high as the
 /// image. Where there are none, it is the canonical `camera`.
 pub fn zoom(mask: &Tensor, rule: Overlay, camera: &Intrinsics, zoom: Zoom) -> Gaze {
@@ -79,29 +84,91 @@ pub fn zoom_overlay(
     camera: &Intrinsics,
     gaze: &Gaze,
 ) -> Tensor {
-    let Shape { height, width, .. } = image.shape();
-    let focal = [camera.fx as f32, camera.fy as f32];
-    let centre = [camera.cx as f32, camera.cy as f32];
-    let (mut seen, mut covered) = (image.clone(), mask.clone());
+    let [seen, covered] = [image, mask].map(|source| sampled(source, camera, gaze));
+    overlay(&seen, &covered, rule)
+}
+
+/// `image` of the canonical `camera` as `gaze` sees it: sampled bilinearly, black beyond its borders. Through the canonical
+/// camera itself it stays as it is.
+pub fn zoom_image(image: &Tensor, camera: &Intrinsics, gaze: &Gaze) -> Tensor {
+    if *gaze == Gaze::CANONICAL {
+        return image.clone();
+    }
+    sampled(image, camera, gaze)
+}
+
+/// The canonical `camera`'s mask: `closer`, what `gaze` sees of it, sampled bilinearly as far as it sees, `first` beyond, and
+/// both over the pixel between; all `[1, height, width]`.
+pub fn zoom_mask(closer: &Tensor, first: &Tensor, camera: &Intrinsics, gaze: &Gaze) -> Tensor {
+    let Shape { height, width, .. } = first.shape();
+    let mut mask = first.clone();
+    let (pinhole, zoomed) = (Pinhole::of(camera, 1.0), Pinhole::of(camera, gaze.zoom));
     for y in 0..height {
         for x in 0..width {
-            let ray = gaze.turned_back([
-                (x as f32 - centre[0]) / (focal[0] * gaze.zoom),
-                (y as f32 - centre[1]) / (focal[1] * gaze.zoom),
-                1.0,
-            ]);
-            // Behind the canonical camera it sees nothing.
-            let at = (ray[2] > 1e-3)
-                .then(|| [0, 1].map(|axis| ray[axis] / ray[2] * focal[axis] + centre[axis]));
-            let from = |source: &Tensor, channel| at.map_or(0.0, |at| sample(source, channel, at));
+            let Some(at) = zoomed.place(gaze.turned(pinhole.ray(x, y))) else {
+                continue;
+            };
             let to = y * width + x;
-            covered.data[to] = from(mask, 0);
-            for channel in 0..image.shape().channels {
-                seen.data[channel * height * width + to] = from(image, channel);
+            let beyond = 1.0 - inside(closer.shape(), at);
+            mask.data[to] = sample(closer, 0, at) + beyond * first.data[to];
+        }
+    }
+    mask
+}
+
+/// The canonical camera, or one zoomed in.
+struct Pinhole {
+    focal: [f32; 2],
+    centre: [f32; 2],
+}
+
+impl Pinhole {
+    fn of(camera: &Intrinsics, zoom: f32) -> Self {
+        Self {
+            focal: [camera.fx as f32 * zoom, camera.fy as f32 * zoom],
+            centre: [camera.cx as f32, camera.cy as f32],
+        }
+    }
+
+    /// Where pixel `(x, y)` looks.
+    fn ray(&self, x: usize, y: usize) -> [f32; 3] {
+        let [x, y] =
+            [0, 1].map(|axis| ([x, y][axis] as f32 - self.centre[axis]) / self.focal[axis]);
+        [x, y, 1.0]
+    }
+
+    /// The pixel that sees `ray`. Behind the camera it sees nothing.
+    fn place(&self, ray: [f32; 3]) -> Option<[f32; 2]> {
+        let place = [0, 1].map(|axis| ray[axis] / ray[2] * self.focal[axis] + self.centre[axis]);
+        (ray[2] > 1e-3).then_some(place)
+    }
+}
+
+/// What `gaze` sees of `source`, which the canonical `camera` took.
+fn sampled(source: &Tensor, camera: &Intrinsics, gaze: &Gaze) -> Tensor {
+    let Shape {
+        channels,
+        height,
+        width,
+    } = source.shape();
+    let (canonical, zoomed) = (Pinhole::of(camera, 1.0), Pinhole::of(camera, gaze.zoom));
+    let mut seen = source.clone();
+    for y in 0..height {
+        for x in 0..width {
+            let at = canonical.place(gaze.turned_back(zoomed.ray(x, y)));
+            for channel in 0..channels {
+                let value = at.map_or(0.0, |at| sample(source, channel, at));
+                seen.data[(channel * height + y) * width + x] = value;
             }
         }
     }
-    overlay(&seen, &covered, rule)
+    seen
+}
+
+/// How much of a bilinear sample at `at` lies on a plane of `shape`.
+fn inside(shape: Shape, at: [f32; 2]) -> f32 {
+    let share = |at: f32, side: usize| (at + 1.0).min(side as f32 - at).clamp(0.0, 1.0);
+    share(at[0], shape.width) * share(at[1], shape.height)
 }
 
 /// Bilinear, as if zeros lay round the plane.

@@ -70,7 +70,7 @@ pub(super) async fn compare(
 fn expected(model: &Model, image: &reference::Tensor, mask: &[f32]) -> Option<Frame> {
     let description = &model.description;
     let presence = description.presence;
-    let expected = reference::run(&model.mask_network, image)?;
+    let expected = reference::mask(model, image)?;
     let mask = reference::Tensor::new(expected.shape(), mask.to_vec())?;
     Some(Frame {
         coverage: reference::coverage(&mask, presence.mask_threshold, presence.sure_threshold),

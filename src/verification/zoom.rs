@@ -5,10 +5,12 @@ use crate::gpu::{Device, Gazes, GpuError, Layout, Tensor};
 use crate::network::{Overlay, Shape, Zoom};
 use crate::reference;
 
-/// Which of the kernels that turn the joint network's camera: `shaders/zoom*.wgsl`.
+/// Which of the kernels that turn a network's camera: `shaders/zoom*.wgsl`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Part {
     Camera,
+    Image,
+    Mask,
     Overlay,
     Joints,
 }
@@ -58,21 +60,26 @@ pub(super) async fn compare(
         tensor("seen", axes)?,
     );
     let (overlay, joints) = (tensor("overlay", shape)?, tensor("joints", axes)?);
+    let (closer, merged) = (tensor("closer", one)?, tensor("merged", one)?);
     let steps = device.scoped(|| {
         let gazes = Gazes::new(device, camera, batch)?;
         let zoom = gazes.zoom(device, &second, ZOOM, RULE)?;
         let last = match part {
+            Part::Image => gazes.zoom_image(device, &input, &overlay)?,
+            Part::Mask => gazes.zoom_mask(device, &closer, &second, &merged)?,
             Part::Overlay => gazes.zoom_overlay(device, &input, &second, &overlay, RULE)?,
             Part::Camera | Part::Joints => gazes.zoom_joints(device, &sights, &joints)?,
         };
         Ok([zoom, last])
     })?;
     let output = match part {
-        Part::Overlay => &overlay,
+        Part::Image | Part::Overlay => &overlay,
+        Part::Mask => &merged,
         Part::Camera | Part::Joints => &joints,
     };
     let run = async |image: &[f32], mask: &[f32], seen: &[f32]| {
         input.write(device, image)?;
+        closer.write(device, &first_channels(image, shape))?;
         second.write(device, mask)?;
         sights.write(device, seen)?;
         submit(device, |encoder| {
@@ -86,7 +93,7 @@ pub(super) async fn compare(
     let found = run(&image, &mask, &seen).await?;
     let control = match part {
         Part::Camera => run(&image, &other_half(&mask, one), &seen).await?,
-        Part::Overlay => {
+        Part::Image | Part::Mask | Part::Overlay => {
             run(
                 &image.iter().map(|v| v + 1.0).collect::<Vec<_>>(),
                 &mask,
@@ -106,12 +113,17 @@ pub(super) async fn compare(
             let image = reference::Tensor::new(shape, image.to_vec())?;
             let mask = reference::Tensor::new(one, mask.to_vec())?;
             let gaze = reference::zoom(&mask, RULE, &camera, ZOOM);
-            Some(match part {
-                Part::Overlay => reference::zoom_overlay(&image, &mask, RULE, &camera, &gaze)
-                    .data()
-                    .to_vec(),
-                Part::Camera | Part::Joints => reference::zoom_joints(seen, &gaze),
-            })
+            let output = match part {
+                Part::Image => reference::zoom_image(&image, &camera, &gaze),
+                Part::Mask => {
+                    let closer = first_channels(image.data(), shape);
+                    let closer = reference::Tensor::new(one, closer)?;
+                    reference::zoom_mask(&closer, &mask, &camera, &gaze)
+                }
+                Part::Overlay => reference::zoom_overlay(&image, &mask, RULE, &camera, &gaze),
+                Part::Camera | Part::Joints => return Some(reference::zoom_joints(seen, &gaze)),
+            };
+            Some(output.data().to_vec())
         })
         .flatten()
         .collect();
@@ -121,6 +133,14 @@ pub(super) async fn compare(
         allowed: 1e-3 + rounding_of(&expected, layout),
         expected,
     })
+}
+
+/// Of images of `shape`, the first channel.
+fn first_channels(images: &[f32], shape: Shape) -> Vec<f32> {
+    let plane = shape.height * shape.width;
+    let each = images.chunks_exact(shape.len());
+    each.flat_map(|image| image.iter().take(plane).copied())
+        .collect()
 }
 
 /// Masks of which the right or the lower half is left.

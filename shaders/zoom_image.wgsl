@@ -1,0 +1,30 @@
+// A plane of the canonical camera as the zoomed one sees it: sampled bilinearly, black beyond its borders.
+
+// [image]
+@group(0) @binding(3) var<storage, read> gazes: array<Gaze>;
+
+@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let index = (group.y * groups.x + group.x) * 64u + local;
+    let place = output_place(index);
+    if place.plane >= OUTPUT_PLANES {
+        return;
+    }
+    let gaze = gazes[place.plane];
+    // Through the canonical camera itself it stays as it is, to the last bit.
+    if gaze.right.w == 1.0 && gaze.ahead.z == 1.0 {
+        output_set(place.plane, place.y, place.x, input_at(place.plane, place.y, place.x));
+        return;
+    }
+    let size = vec2(f32(INPUT_WIDTH), f32(INPUT_HEIGHT));
+    let s = sample_of(canonical_ray(gaze, place.x, place.y), 1.0, size);
+    let value = input_at(place.plane, s.low.y, s.low.x) * s.weights.x
+        + input_at(place.plane, s.low.y, s.high.x) * s.weights.y
+        + input_at(place.plane, s.high.y, s.low.x) * s.weights.z
+        + input_at(place.plane, s.high.y, s.high.x) * s.weights.w;
+    output_set(place.plane, place.y, place.x, value);
+}
