@@ -16,9 +16,10 @@ ZOOM = {"spread": 5.0, "least": 0.5, "most": 4.0}
 SECOND_LOOK = {"spread": 5.0, "least": 1.0, "most": 2.0}
 
 
-def second_look_of(family):
-    """How the family's mask network looks a second time; None where it looks once."""
-    return SECOND_LOOK if family == "context" else None
+def looks_of(family, rule):
+    """How the family's mask network looks a second time, by the overlay's `rule`: (SECOND_LOOK, rule), or None where it looks
+    once."""
+    return (SECOND_LOOK, rule) if family == "context" else None
 
 
 def look_at(masks, zoom, rule, camera=CAMERA):
