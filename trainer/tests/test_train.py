@@ -14,12 +14,12 @@ from safetensors.torch import load_file
 
 from arms import BODY
 from conftest import draw_recording
-from whereabot_trainer import data, evaluate, export, golden, losses, pipeline
+from whereabot_trainer import data, evaluate, export, golden, losses, pipeline, zoom
 from whereabot_trainer.__main__ import main
 from whereabot_trainer.export import SURE_THRESHOLDS, choose_presence
-from whereabot_trainer.model import read_model
+from whereabot_trainer.model import read_model, write_model
 from whereabot_trainer.networks import (
-    JOINT_INPUT, MASK_INPUT, Network, back_project, context_mask_layers, heatmap_joint_layers, paper_joint_layers,
+    JOINT_INPUT, MASK_INPUT, OVERLAYS, Network, back_project, context_mask_layers, heatmap_joint_layers, paper_joint_layers,
     paper_mask_layers, soft_argmax2d)
 from whereabot_trainer.train import heat_loss, load_network, output_unit, start_from
 
@@ -271,15 +271,15 @@ def test_committed_golden_files_are_what_pytorch_computes(tmp_path, request):
     committed = request.config.rootpath.parent / "tests" / "data" / "golden"
     golden.write_golden(tmp_path)
     names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == sorted(path.name for path in committed.iterdir()) and len(names) == 14
+    assert names == sorted(path.name for path in committed.iterdir()) and len(names) == 16
     for name in names:
         made, kept = load_file(tmp_path / name), load_file(committed / name)
-        zoomed = name == "zoom.activations.safetensors"
+        zoomed = name in ("zoom.activations.safetensors", "second_look.activations.safetensors")
         assert not _unlike(made, kept, zoomed), name
         # Negative control: a value three bounds off, of those behind a zoom and of those before it.
-        for part in ("mask.", "joint"):
+        for part in ("mask.", "joint", *(["second.", "merged"] if "merged" in kept else [])):
             key = next(key for key in kept if key.startswith(part))
-            off = 3e-5 if zoomed and part == "joint" else 3e-6
+            off = 3e-5 if zoomed and part != "mask." else 3e-6
             largest = max(1.0, float(kept[key].float().abs().max()))
             wrong = made[key].float().flatten().clone()
             wrong[wrong.abs().argmin()] += off * largest
@@ -311,6 +311,77 @@ def test_joints_are_trained_on_beside_a_model_file_s_mask_network(train, recordi
     for key in ("mask_training", "calibration"):
         assert again["card"][key] == description["card"][key]
     assert again["presence"] == description["presence"]
+
+
+def test_a_model_file_is_exported_again_with_the_second_look_of_its_family(train, recording, tmp_path, monkeypatch):
+    steps = ["--iterations", "2", "--validation-samples", "4", "--family", "context"]
+    mask_run, joint_run = train("train-mask", "mask", *steps, "--crop", "32", "24"), train("train-joint", "joint", *steps)
+
+    def exported(mask, joint, *flags):
+        out = tmp_path / "out.safetensors"
+        main(["export", "--mask", str(mask), "--joint", str(joint), "--validation", str(recording), "--out", str(out),
+              "--validation-samples", "20", "--cache", str(tmp_path / "cache"), *flags])
+        return read_model(out)
+
+    def file(name, **changes):
+        description = {**first, **changes}
+        write_model(tmp_path / name, mask, joint, {key: value for key, value in description.items() if value is not None})
+        return tmp_path / name
+
+    mask, joint, first = exported(mask_run, joint_run)
+    assert first["second_look"] == zoom.SECOND_LOOK and first["card"]["joint_training"]["min_coverage"] == 0.005
+    again = exported(file("same"), tmp_path / "same")
+    assert again[2] == first
+    for kept, network in zip(again, (mask, joint), strict=False):
+        assert all(torch.equal(tensor, network.state_dict()[key]) for key, tensor in kept.state_dict().items())
+
+    # What presence was chosen by stays, or does not.
+    other = {"mask_threshold": 0.5, "sure_threshold": 0.6, "min_sure": 0.6}
+    assert exported(file("other", presence=other), tmp_path / "same")[2]["presence"] == other != first["presence"]
+    renewed = exported(file("one-look", presence=other, second_look=None), tmp_path / "same")[2]
+    assert renewed["presence"] == first["presence"] and renewed["second_look"] == first["second_look"]
+    monkeypatch.setattr(zoom, "SECOND_LOOK", {"spread": 5.0, "least": 3.0, "most": 4.0})
+    nearer = exported(tmp_path / "other", tmp_path / "same")[2]
+    assert nearer["second_look"] == zoom.SECOND_LOOK and nearer["presence"] != other
+    for figure in ("iou", "estimated_mask_mean_cm"):
+        assert nearer["card"]["figures"][figure] != first["card"]["figures"][figure]
+    assert nearer["card"]["figures"]["true_mask_mean_cm"] == first["card"]["figures"]["true_mask_mean_cm"]
+
+    with pytest.raises(SystemExit, match="of ur10, not of ur5"):
+        exported(mask_run, file("ur10", robot="ur10"))
+    for given in ((mask_run, tmp_path / "none"), (tmp_path / "none", joint_run)):
+        with pytest.raises(SystemExit, match="a run or a model file, found .*none"):
+            exported(*given)
+
+
+def test_calibration_is_of_both_looks(train, recording, tmp_path, monkeypatch):
+    steps = ["--iterations", "1", "--validation-samples", "4", "--family", "context"]
+    mask, joint = train("train-mask", "mask", *steps, "--crop", "32", "24"), train("train-joint", "joint", *steps)
+    shifts = {None: -2.0, (("spread", 5.0), ("least", 1.0), ("most", 2.0)): 0.3}
+    monkeypatch.setattr(evaluate, "calibrate", lambda *given: shifts[tuple(given[4][0].items()) if len(given) > 4 else None])
+    main(["export", "--mask", str(mask), "--joint", str(joint), "--validation", str(recording), "--validation-samples", "10",
+          "--out", str(tmp_path / "out"), "--cache", str(tmp_path / "cache")])
+    network, _, description = read_model(tmp_path / "out")
+    assert description["card"]["calibration"]["logit_shift"] == -1.7
+    added = network.conv11.bias - load_network(mask)[0].conv11.bias
+    assert added.item() == pytest.approx(-1.7, abs=1e-6)
+
+
+@pytest.mark.parametrize("family", ["paper", "context"])
+def test_joints_are_trained_behind_what_export_s_masks_will_be(train, monkeypatch, family):
+    masks_of, seen = evaluate.masks_of, []
+
+    def spy(network, images, looks=None, bf16=False):
+        seen.append((looks, bf16))
+        return masks_of(network, images, looks, bf16)
+
+    mask_run = train("train-mask", "mask", "--iterations", "1", "--validation-samples", "4", "--crop", "32", "24", "--family", family)
+    monkeypatch.setattr(evaluate, "masks_of", spy)
+    train("train-joint", "joint", "--iterations", "1", "--validation-samples", "4", "--mask-run", str(mask_run),
+          "--estimated-masks", "1", "--family", "context")
+    looks = (zoom.SECOND_LOOK, OVERLAYS["ramp"]) if family == "context" else None
+    # Those that are trained on in bfloat16, those that the log tells of not.
+    assert set(map(repr, seen)) == {repr((looks, True)), repr((looks, False))}
 
 
 def test_several_runs_are_exported_as_the_mean_of_their_weights(train, recording, tmp_path):

@@ -1,6 +1,6 @@
 import torch
 
-from whereabot_trainer import zoom
+from whereabot_trainer import evaluate, zoom
 from whereabot_trainer.networks import CAMERA, INPUT_HEIGHT, INPUT_WIDTH, OVERLAYS, overlay
 
 
@@ -77,3 +77,66 @@ def test_varied_cameras_still_look_there():
     assert (axes[:, 2] > 0.99).all() and axes[:, 0].std() > 0.005
     assert torch.allclose(rotations @ rotations.mT, torch.eye(3), atol=1e-5)
     assert 1.6 < zooms.min() < 1.9 < 2.1 < zooms.max() < 2.4
+
+
+def test_a_second_look_is_merged_where_it_sees_and_the_first_stays_elsewhere():
+    rotations = zoom.turns(*torch.deg2rad(torch.tensor([[14.0, -5.0], [-9.0, 4.0], [0.0, 7.0]])))
+    zooms = torch.tensor([2.0, 1.4])
+    v, u = torch.meshgrid(torch.arange(INPUT_HEIGHT), torch.arange(INPUT_WIDTH), indexing="ij")
+    # Linear in the pixel: a bilinear sample of it is exact.
+    second, first = ((2 * u + v) / 1000).expand(2, 1, -1, -1), torch.full((2, 1, INPUT_HEIGHT, INPUT_WIDTH), 0.25)
+    merged = zoom.merge(first, second, rotations, zooms)
+    inside, border = 0, 0
+    for number in range(2):
+        for y in range(0, INPUT_HEIGHT, 3):
+            for x in range(0, INPUT_WIDTH, 3):
+                ray = torch.tensor([(x - CAMERA["cx"]) / CAMERA["fx"], (y - CAMERA["cy"]) / CAMERA["fy"], 1.0])
+                seen = rotations[number] @ ray
+                q = [float(seen[axis] / seen[2] * zooms[number] * CAMERA[f"f{name}"] + CAMERA[f"c{name}"])
+                     for axis, name in enumerate("xy")]
+                ends = [min(q[0], INPUT_WIDTH - 1 - q[0]), min(q[1], INPUT_HEIGHT - 1 - q[1])]
+                found = float(merged[number, 0, y, x])
+                if min(ends) > 0.01:
+                    inside += 1
+                    assert abs(found - (2 * q[0] + q[1]) / 1000) < 1e-4
+                elif min(ends) <= -1:
+                    assert found == 0.25
+                else:
+                    border += 1
+    count = len(range(0, INPUT_HEIGHT, 3)) * len(range(0, INPUT_WIDTH, 3))
+    # Neither look is all of it, and few pixels are left unlooked at.
+    assert 0.3 * 2 * count < inside < 0.8 * 2 * count and border < 0.05 * count
+    # The first look is what shows through, and no other turn will do.
+    assert (zoom.merge(first + 0.5, second, rotations, zooms) != merged).any()
+    assert (zoom.merge(first, second, rotations.mT, zooms) - merged).abs().max() > 0.1
+
+
+def test_at_the_border_of_a_second_look_the_mask_does_not_jump():
+    nothing, all_of_it = torch.zeros(1, 1, INPUT_HEIGHT, INPUT_WIDTH), torch.ones(1, 1, INPUT_HEIGHT, INPUT_WIDTH)
+    pans = torch.deg2rad(torch.linspace(8, 9, 300))
+    zeros = torch.zeros(1)
+    masks = torch.cat([
+        zoom.merge(nothing, all_of_it, zoom.turns(pan[None], zeros, zeros), torch.full((1,), 1.5)) for pan in pans])
+    # The border passes some columns of pixels, by about two hundredths of a pixel of the second look a step.
+    assert (masks[0] != masks[-1]).any() and masks.diff(dim=0).abs().max() < 0.05
+    # A border that belonged to either look would jump.
+    assert (masks > 0.999).float().diff(dim=0).abs().max() == 1
+
+
+class _Bright(torch.nn.Module):
+    """As probable as it is red."""
+
+    def forward(self, images):
+        return images[:, :1].sigmoid() * 0.8
+
+
+def test_with_nothing_to_look_at_the_second_look_is_the_first():
+    torch.manual_seed(0)
+    images = torch.rand(2, 3, INPUT_HEIGHT, INPUT_WIDTH)
+    images[0] -= 5
+    images[1, :, 60:100, 30:90] += 5
+    looks = zoom.SECOND_LOOK, OVERLAYS["ramp"]
+    once, twice = evaluate.masks_of(_Bright(), images), evaluate.masks_of(_Bright(), images, looks)
+    assert once[0].max() < OVERLAYS["ramp"]["low"] and torch.allclose(once[0], twice[0], atol=1e-4)
+    # Where there is something, it is looked at.
+    assert not torch.allclose(once[1], twice[1], atol=0.1)

@@ -125,14 +125,15 @@ def main(argv=None):
                          help="share of training samples with the mask run's masks for the true ones (%(default)s)")
     command.add_argument("--estimated-after", type=float, default=0.0, metavar="PROGRESS",
                          help="from this progress (0 to 1) on (%(default)s)")
-    command.add_argument("--min-coverage", type=float, default=0.005, metavar="SHARE",
+    command.add_argument("--min-coverage", type=float, default=train.MIN_COVERAGE, metavar="SHARE",
                          help="leave out samples with less of the robot in view (%(default)s)")
     command.set_defaults(run=_run(train.train_joint))
 
     command = commands.add_parser("export", help="write both networks as a model file")
     command.add_argument("--mask", required=True, nargs="+", metavar="RUN", help="run of train-mask, or a model file whose mask"
                          " network stays; of several runs that started from each other, the mean of their weights")
-    command.add_argument("--joint", required=True, nargs="+", metavar="RUN", help="run of train-joint; of several likewise")
+    command.add_argument("--joint", required=True, nargs="+", metavar="RUN", help="run of train-joint, or a model file likewise; of several runs,"
+                         " likewise")
     source = command.add_mutually_exclusive_group(required=True)
     source.add_argument("--validation", nargs="+", metavar="DIR",
                         help="recordings to choose the presence threshold and measure the figures on")

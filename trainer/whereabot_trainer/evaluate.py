@@ -26,29 +26,37 @@ def shift_logits(network, shift):
 
 
 @torch.no_grad()
-def masks_of(network, images, bf16=False):
-    with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
-        return network(images.contiguous(memory_format=torch.channels_last)).float()
+def masks_of(network, images, looks=None, bf16=False):
+    """The masks [N, 1, H, W] of `images`; with two looks, `looks` being the second one's zoom and the overlay's rule."""
+    def look(images):
+        with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
+            return network(images.contiguous(memory_format=torch.channels_last)).float()
+
+    first = look(images)
+    if looks is None:
+        return first
+    cameras = zoom.look_at(first, *looks)
+    return zoom.merge(first, look(zoom.see(images, *cameras)), *cameras)
 
 
-def estimate_masks(network, samples, numbers, device):
-    """The mask network's answer for each sample as {number: uint8 [H, W]}, 255 for certain."""
+def estimate_masks(network, samples, numbers, device, looks=None):
+    """The mask network's answer for each sample as {number: uint8 [H, W]}, 255 for certain; `looks` as of `masks_of`."""
     answers = {}
     for batch in _batches(numbers):
-        estimate = masks_of(network, samples.pixels(batch)[0].to(device))
+        estimate = masks_of(network, samples.pixels(batch)[0].to(device), looks)
         for number, mask in zip(batch, estimate, strict=True):
             answers[int(number)] = (mask[0] * 255).round().byte().cpu().numpy()
     return answers
 
 
-def mask_histograms(network, samples, numbers, device):
+def mask_histograms(network, samples, numbers, device, looks=None):
     """Pixels by logit: (robot, background), each [N, bins], for each of the samples."""
     bins = len(LOGIT_EDGES) - 1
     edges = torch.from_numpy(LOGIT_EDGES[1:-1]).to(device)
     histograms = []
     for batch in _batches(numbers):
         images, masks = samples.pixels(batch)
-        logits = torch.logit(masks_of(network, images.to(device)).double(), eps=1e-6)
+        logits = torch.logit(masks_of(network, images.to(device), looks).double(), eps=1e-6)
         # A value on an edge is of the bin above.
         counted = torch.bucketize(logits, edges, right=True) + bins * (masks.to(device) < 0.5)
         histograms += [torch.bincount(each.flatten(), minlength=2 * bins).cpu().numpy() for each in counted]
@@ -73,15 +81,15 @@ def figures_by_threshold(robot, background):
     }
 
 
-def calibrate(network, samples, numbers, device):
+def calibrate(network, samples, numbers, device, looks=None):
     """The shift of the logit that gives the best IoU at the threshold 0.5."""
-    curves = figures_by_threshold(*mask_histograms(network, samples, numbers, device))
+    curves = figures_by_threshold(*mask_histograms(network, samples, numbers, device, looks))
     return round(float(-LOGIT_EDGES[int(curves["iou"].argmax())]), 3)
 
 
-def score_mask(network, samples, numbers, device, shift=0.0):
+def score_mask(network, samples, numbers, device, shift=0.0, looks=None):
     """Figures at the threshold 0.5, the logits being shifted."""
-    curves = figures_by_threshold(*mask_histograms(network, samples, numbers, device))
+    curves = figures_by_threshold(*mask_histograms(network, samples, numbers, device, looks))
     half = int(np.argmin(np.abs(LOGIT_EDGES[:-1] + shift)))
     return {name: round(float(curve[half]), 4) for name, curve in curves.items()}
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from . import __version__, data, evaluate, kinematic_fit
+from . import __version__, data, evaluate, kinematic_fit, zoom
 from .model import describe, read_model, write_model
-from .train import kept_arm_lengths, load_mask, load_network, output_unit
+from .train import MIN_COVERAGE, kept_arm_lengths, load_network, output_unit
 
 # From fewer samples the errors of six joints cannot be told.
 LEAST_LEARNED = 30
@@ -36,6 +36,15 @@ def choose_presence(robots, without, passing=0.05):
     return threshold, least
 
 
+def _model_file(paths):
+    """The model file that is given in place of runs; None where runs are."""
+    if len(paths) > 1 or Path(paths[0]).is_dir():
+        return None
+    if not Path(paths[0]).exists():
+        raise SystemExit(f"expected the folder of a run or a model file, found {paths[0]}")
+    return paths[0]
+
+
 def _mean_of(runs):
     """(the network whose weights are the mean of the `runs`', the last one's checkpoint, what the card says of the mean). Of
     runs of which one started from the other, or all from the same, the mean often errs less than any (Wortsman et al., 2022)."""
@@ -55,20 +64,25 @@ def _mean_of(runs):
 
 def export_runs(args):
     """Folds calibration and standardisation into the weights, measures the cascade, and writes the model file."""
-    trained = Path(args.mask[-1]).is_dir()
-    mask, _, mask_mean = _mean_of(args.mask) if trained else (load_mask(args.mask[0]), None, {})
-    mask_card = _mask_card(args.mask[-1])
-    joint, joint_state, joint_mean = _mean_of(args.joint)
-    rules = joint_state["card"]["overlay"], joint_state["card"].get("zoom")
+    mask_file, joint_file = _model_file(args.mask), _model_file(args.joint)
+    mask, _, mask_mean = _mean_of(args.mask) if not mask_file else (read_model(mask_file)[0], None, {})
+    joint, joint_state, joint_mean = _mean_of(args.joint) if not joint_file else (read_model(joint_file)[1], None, {})
+    mask_card, joint_card = _mask_card(args.mask[-1]), _joint_card(args.joint[-1])
+    family, rules = mask_card["mask_training"]["family"], (joint_card["overlay"], joint_card["zoom"])
+    looks = zoom.looks_of(family, rules[0])
+    second_look = looks and looks[0]
 
-    samples = data.Samples(args.validation or args.recording, args.cache, kept_arm_lengths(joint_state))
+    samples = data.Samples(args.validation or args.recording, args.cache, joint_card["arm_lengths"])
     robots = sorted(set(samples.robots))
     robot = args.robot or robots[0]
     if robot not in robots or (len(robots) > 1 and not args.robot):
         raise SystemExit(f"--robot: expected one of {', '.join(robots)}, found {args.robot or 'none'}")
     own = samples.robots == robot
     arm = float(samples.arms[own][0])
-    output_unit(joint_state["card"]).fold(joint, arm)
+    if not joint_file:
+        output_unit(joint_state["card"]).fold(joint, arm)
+    elif robot not in joint_card["arm_lengths"]:
+        raise SystemExit(f"--joint: {joint_file} is of {', '.join(joint_card['arm_lengths'])}, not of {robot}")
     # What the mask's threshold and presence are chosen on is not reported on. How many images without a robot pass is
     # seen on all robots' recordings: one has few such images.
     if args.validation:
@@ -84,25 +98,30 @@ def export_runs(args):
         chosen = np.random.default_rng(args.seed).permutation(training)[: args.validation_samples]
     order = np.union1d(chosen, reported)
 
-    if trained:
+    if not mask_file:
         shift = evaluate.calibrate(mask, samples, chosen[own[chosen]], args.device)
         evaluate.shift_logits(mask, shift)
+        if looks:
+            # Only a calibrated first look tells where the second one is to be.
+            more = evaluate.calibrate(mask, samples, chosen[own[chosen]], args.device, looks)
+            evaluate.shift_logits(mask, more)
+            shift = round(shift + more, 3)
         mask_card["calibration"]["logit_shift"] = shift
-    estimated = evaluate.estimate_masks(mask, samples, order, args.device)
-    seen = samples.has_robot & (samples.coverage >= joint_state["card"]["min_coverage"])
+    estimated = evaluate.estimate_masks(mask, samples, order, args.device, looks)
+    seen = samples.has_robot & (samples.coverage >= joint_card["min_coverage"])
     empty = samples.coverage == 0
 
     def shares(numbers, threshold):
         return [float((estimated[n] >= 255 * threshold).mean()) for n in numbers]
 
-    if trained:
+    kept = read_model(mask_file)[2] if mask_file else None
+    if kept and kept.get("second_look") == second_look:
+        # It is the mask network's, which stays.
+        sure, least = kept["presence"]["sure_threshold"], kept["presence"]["min_sure"]
+    else:
         sure, least = choose_presence(*(
             {threshold: shares(chosen[kind[chosen]], threshold) for threshold in SURE_THRESHOLDS}
             for kind in (seen & own, empty)))
-    else:
-        # It is the mask network's, which stays.
-        presence = read_model(args.mask[-1])[2]["presence"]
-        sure, least = presence["sure_threshold"], presence["min_sure"]
 
     # How the joint network errs is measured where presence is chosen, on this robot.
     learned = chosen[own[chosen] & seen[chosen]]
@@ -120,7 +139,7 @@ def export_runs(args):
             unfitted = "joints are not those of an arm of Universal Robots' kind"
 
     shown = reported[seen[reported]]
-    measured = evaluate.score_mask(mask, samples, reported, args.device)
+    measured = evaluate.score_mask(mask, samples, reported, args.device, looks=looks)
     figures = {name: measured[name] for name in ("accuracy", "iou", "precision", "recall")}
     for name, masks in (("true_mask", None), ("estimated_mask", estimated)):
         figures |= evaluate.score_joints(
@@ -138,16 +157,17 @@ def export_runs(args):
 
     card = {
         "task": "mask and joints (metres, camera optical frame) of one robot arm in one colour image",
-        "data": {"training": joint_state["card"]["training_recordings"], "validation": samples.sources,
-                 "protocol": joint_state["card"]["protocol"], "note": args.note},
+        "data": {"training": joint_card["training"], "validation": samples.sources, "protocol": joint_card["protocol"],
+                 "note": args.note},
         "arm_length_m": arm, "fit": fitted_arm is not None,
-        "mask_training": mask_card["mask_training"] | mask_mean, "joint_training": _training(joint_state) | joint_mean,
+        "mask_training": mask_card["mask_training"] | mask_mean, "joint_training": joint_card["joint_training"] | joint_mean,
         "calibration": mask_card["calibration"], "figures": figures,
-        "curves": {"mask_accuracy": mask_card["curves"]["mask_accuracy"], **_curves(args.joint[-1], JOINT_CURVES)}, "trainer": f"whereabot-trainer {__version__}, torch {torch.__version__.split('+')[0]}",
+        "curves": {"mask_accuracy": mask_card["curves"]["mask_accuracy"], **joint_card["curves"]},
+        "trainer": f"whereabot-trainer {__version__}, torch {torch.__version__.split('+')[0]}",
         "licence": args.licence,
     }
     description = describe(
-        mask.layers, joint.layers, family=mask_card["mask_training"]["family"], robot=robot, overlay=rules[0], zoom=rules[1],
+        mask.layers, joint.layers, family=family, robot=robot, overlay=rules[0], zoom=rules[1], second_look=second_look,
         arm=fitted_arm, presence={"mask_threshold": 0.5, "sure_threshold": sure, "min_sure": least}, card=card)
     write_model(args.out, mask, joint, description, args.dtype)
     print(json.dumps({"chosen": description["presence"], "figures": figures}, indent=1))
@@ -177,6 +197,26 @@ def _mask_card(path):
     }
 
 
+def _joint_card(path):
+    """What there is to know of the joint network of a run's folder or, as it stands there, of a model file."""
+    if not Path(path).is_dir():
+        description = read_model(path)[2]
+        card = description["card"]
+        return {
+            "overlay": description["overlay"], "zoom": description.get("zoom"),
+            "arm_lengths": {description["robot"]: card["arm_length_m"]},
+            "min_coverage": card["joint_training"].get("min_coverage", MIN_COVERAGE),
+            "training": card["data"]["training"], "protocol": card["data"]["protocol"],
+            "joint_training": card["joint_training"],
+            "curves": {name: curve for name, curve in card["curves"].items() if name in JOINT_CURVES.values()}}
+    state = load_network(path)[1]
+    card = state["card"]
+    return {
+        "overlay": card["overlay"], "zoom": card.get("zoom"), "arm_lengths": kept_arm_lengths(state),
+        "min_coverage": card["min_coverage"], "training": card["training_recordings"], "protocol": card["protocol"],
+        "joint_training": _training(state), "curves": _curves(path, JOINT_CURVES)}
+
+
 def _curves(run, columns):
     """Validation figures over iterations (the paper's three plots), as lists of [iteration, value]."""
     with open(Path(run) / "log.csv", newline="") as file:
@@ -188,7 +228,7 @@ def _curves(run, columns):
 def _training(state):
     keep = ("family", "protocol", "seed", "precision", "optimizer", "learning_rate", "momentum", "batch", "normalise",
             "samples", "crop", "zoom", "negatives", "negative_share", "foreground_share", "w_fg", "w_bg",
-            "estimated_masks", "estimated_after", "init_from", "heat_weight")
+            "min_coverage", "estimated_masks", "estimated_after", "init_from", "heat_weight")
     return {key: state["card"][key] for key in keep if key in state["card"]} | {
         "minutes": round(state["seconds"] / 60, 1), "iterations": state["iteration"],
         "samples_available": sum(source["samples"] for source in state["card"]["training_recordings"])}

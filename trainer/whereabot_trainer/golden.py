@@ -2,7 +2,8 @@
 
 `NAME.safetensors` is a complete model file. `NAME.activations.safetensors` holds, in f32 and without a batch
 dimension, the input `mask.image`, every layer's output as `mask.{layer}` and `joint.{layer}`, the joint network's
-input `joint.overlay`, and the cascade's result `joints` [18], in the canonical camera's frame.
+input `joint.overlay`, and the cascade's result `joints` [18], in the canonical camera's frame. Where the mask network looks
+a second time, that look's input is `second.image`, its layers `second.{layer}`, and the mask of both looks `merged`.
 """
 
 from pathlib import Path
@@ -123,8 +124,14 @@ def _networks(seed, image, mask_layers, joint_layers):
 def cascade_activations(mask, joint, description, image):
     """Every value of the cascade on one image [3, H, W], by `{network}.{layer}`."""
     values = {f"mask.{name}": value[0] for name, value in mask.activations(image[None]).items()}
-    seen, cameras = overlays(image[None], values["mask.mask"][None], description["overlay"], description.get("zoom"),
-                             description["camera"])
+    estimate = values["mask.mask"][None]
+    if "second_look" in description:
+        cameras = zoom.look_at(estimate, description["second_look"], description["overlay"], description["camera"])
+        second = mask.activations(zoom.see(image[None], *cameras, description["camera"]))
+        values |= {f"second.{name}": value[0] for name, value in second.items()}
+        estimate = zoom.merge(estimate, second["mask"], *cameras, description["camera"])
+        values["merged"] = estimate[0]
+    seen, cameras = overlays(image[None], estimate, description["overlay"], description.get("zoom"), description["camera"])
     values |= {f"joint.{name}": value[0] for name, value in joint.activations(seen).items()}
     # A vector, not an image of one pixel.
     values = {name: value.flatten() if value.shape[1:] == (1, 1) else value for name, value in values.items()}
@@ -138,7 +145,8 @@ def cascade_activations(mask, joint, description, image):
 
 
 def write_golden(folder, seed=1):
-    """Writes the models `tiny`, `threshold`, `tiny_f16`, `context`, `heatmap`, `zoom` and `arm` with their activations."""
+    """Writes the models `tiny`, `threshold`, `tiny_f16`, `context`, `heatmap`, `zoom`, `arm` and `second_look` with their
+    activations."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     torch.use_deterministic_algorithms(True)
@@ -150,11 +158,16 @@ def write_golden(folder, seed=1):
     heatmap = (MASK_LAYERS, HEATMAP_LAYERS, WIDTH, HEIGHT)
     # The mask is spread over the whole small image: this looks at the middle half of it.
     view = {"spread": 2.0, "least": 0.5, "most": 4.0}
-    for name, family, (mask_layers, joint_layers, width, height), rule, view, arm, dtype in (
-        ("tiny", "paper", paper, multiply, None, None, "f32"), ("threshold", "paper", paper, threshold, None, None, "f32"),
-        ("tiny_f16", "paper", paper, multiply, None, None, "f16"), ("context", "context", context, multiply, None, None, "f32"),
-        ("heatmap", "context", heatmap, multiply, None, None, "f32"), ("zoom", "context", heatmap, ramp, view, None, "f32"),
-        ("arm", "paper", paper, multiply, None, ARM, "f32"),
+    # What of the mask is above one half lies to one side: the second look is beside the middle and sees half of the image.
+    second_look, beside = {"spread": 2.0, "least": 1.0, "most": 4.0}, {"rule": "ramp", "low": 0.5, "high": 0.9}
+    for name, family, (mask_layers, joint_layers, width, height), rule, second_look, view, arm, dtype in (
+        ("tiny", "paper", paper, multiply, None, None, None, "f32"),
+        ("threshold", "paper", paper, threshold, None, None, None, "f32"),
+        ("tiny_f16", "paper", paper, multiply, None, None, None, "f16"),
+        ("context", "context", context, multiply, None, None, None, "f32"),
+        ("heatmap", "context", heatmap, multiply, None, None, None, "f32"),
+        ("zoom", "context", heatmap, ramp, None, view, None, "f32"), ("arm", "paper", paper, multiply, None, None, ARM, "f32"),
+        ("second_look", "context", heatmap, beside, second_look, view, None, "f32"),
     ):
         image = torch.rand((3, height, width), generator=torch.Generator().manual_seed(seed))
         mask, joint = _networks(seed, image, mask_layers, joint_layers)
@@ -163,7 +176,7 @@ def write_golden(folder, seed=1):
                 joint.dense.weight *= 0.02
                 joint.dense.bias[:] = torch.tensor(ARM_JOINTS)
         description = describe(
-            mask_layers, joint_layers, family=family, robot="golden", overlay=rule, zoom=view, arm=arm, width=width, height=height,
+            mask_layers, joint_layers, family=family, robot="golden", overlay=rule, zoom=view, second_look=second_look, arm=arm, width=width, height=height,
             camera={"fx": 14.25, "fy": 14.25, "cx": (width - 1) / 2, "cy": (height - 1) / 2},
             presence={"mask_threshold": 0.5, "sure_threshold": 0.7, "min_sure": 0.01}, card=CARD)
         path = folder / f"{name}.safetensors"

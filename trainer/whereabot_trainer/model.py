@@ -14,13 +14,13 @@ DTYPES = {"f32": torch.float32, "f16": torch.float16}
 
 
 def describe(mask_layers, joint_layers, *, family, robot, overlay, zoom, arm, presence, card,
-             width=INPUT_WIDTH, height=INPUT_HEIGHT, camera=CAMERA):
+             second_look=None, width=INPUT_WIDTH, height=INPUT_HEIGHT, camera=CAMERA):
     """The description that the engine reads from the model file."""
     return {
         "version": 1, "family": family, "robot": robot, "joints": JOINTS,
         "input": {"width": width, "height": height}, "camera": camera,
         "mask_network": {"layers": mask_layers}, "overlay": overlay,
-        **({"zoom": zoom} if zoom else {}),
+        **({"zoom": zoom} if zoom else {}), **({"second_look": second_look} if second_look else {}),
         "joint_network": {"layers": joint_layers}, **({"arm": arm} if arm else {}), "presence": presence, "card": card,
     }
 

@@ -282,12 +282,13 @@ def load_network(run):
 
 
 def load_mask(path):
-    """The mask network of a run's folder, calibrated, or of a model file, which is; in eval mode."""
+    """(the mask network, its family) of a run's folder, calibrated, or of a model file, which is; in eval mode."""
     if not Path(path).is_dir():
-        return read_model(path)[0]
+        mask, _, description = read_model(path)
+        return mask, description["family"]
     network, state = load_network(path)
     evaluate.shift_logits(network, state["figures"]["logit_shift"])
-    return network
+    return network, state["card"]["family"]
 
 
 @torch.no_grad()
@@ -476,6 +477,10 @@ def heat_loss(heat, place, truth):
     return (entropies * inside).sum() / inside.sum().clamp(min=1)
 
 
+# Less of a robot in view does not tell where its joints are.
+MIN_COVERAGE = 0.005
+
+
 def train_joint(args):
     state = kept_state(args)
     samples, numbers, held_out, validation, card = load_samples(args, state)
@@ -506,10 +511,13 @@ def train_joint(args):
         card |= {"init_from": Path(args.init_from).name}
     network = network.to(args.device, memory_format=torch.channels_last)
 
-    mask_network = held_out_estimated = None
+    mask_network = looks = held_out_estimated = None
     if args.mask_run:
-        mask_network = load_mask(args.mask_run).to(args.device, memory_format=torch.channels_last)
-        held_out_estimated = evaluate.estimate_masks(mask_network, held_out, validation, args.device)
+        mask_network, mask_family = load_mask(args.mask_run)
+        mask_network = mask_network.to(args.device, memory_format=torch.channels_last)
+        # As export will have it, whatever a model file had.
+        looks = zoom.looks_of(mask_family, rule)
+        held_out_estimated = evaluate.estimate_masks(mask_network, held_out, validation, args.device, looks)
     elif args.estimated_masks > 0:
         raise SystemExit("--estimated-masks needs --mask-run")
 
@@ -519,7 +527,7 @@ def train_joint(args):
         images = data.jitter_some_colours(images)
         rows = torch.rand(len(batch)) < (args.estimated_masks if progress >= args.estimated_after else 0)
         if rows.any():
-            estimates = evaluate.masks_of(mask_network, images[rows], args.precision == "bf16")
+            estimates = evaluate.masks_of(mask_network, images[rows], looks, args.precision == "bf16")
             moved = torch.rand(len(estimates)) < data.VARIED
             if moved.any():
                 estimates[moved] = data.jitter_masks(estimates[moved])

@@ -1,4 +1,5 @@
-"""The joint network's camera: at the place of the canonical one, but turned towards the robot and zoomed in on it.
+"""The joint network's camera: at the place of the canonical one, but turned towards the robot and zoomed in on it. The mask
+network's second look is through such a camera, too.
 
 An arm is then seen in the middle of the picture and at about the same size, wherever it is in the image. The turn is a
 rotation and the zoom a focal length, so that what is seen is exact for a pinhole; the network's depths are those of the
@@ -11,6 +12,14 @@ from .networks import CAMERA, share
 
 # The picture's side spans so many standard deviations of the mask: nineteen arms in twenty are seen whole.
 ZOOM = {"spread": 5.0, "least": 0.5, "most": 4.0}
+# Of the mask network: what fills the picture already gains nothing by a smaller one, and masks are trained at sizes within this.
+SECOND_LOOK = {"spread": 5.0, "least": 1.0, "most": 2.0}
+
+
+def looks_of(family, rule):
+    """How the family's mask network looks a second time, by the overlay's `rule`: (SECOND_LOOK, rule), or None where it looks
+    once."""
+    return (SECOND_LOOK, rule) if family == "context" else None
 
 
 def look_at(masks, zoom, rule, camera=CAMERA):
@@ -62,19 +71,39 @@ def turns(pan, tilt, roll):
 
 def see(images, rotations, zooms, camera=CAMERA):
     """What the cameras see of `images` [N, C, H, W] of the canonical camera: bilinear, zero beyond them."""
-    count, _, height, width = images.shape
+    k, ray = _pinhole(images, camera)
+    ray = torch.cat([ray / zooms[:, None, None], torch.ones(len(images), ray.shape[1], 1, device=images.device)], 2)
+    return _sample(images, ray @ (k @ rotations.mT).mT)
+
+
+def merge(first, second, rotations, zooms, camera=CAMERA):
+    """The canonical camera's masks [N, 1, H, W]: `second`, which those cameras see, and beyond their view `first`. At a view's
+    border, where a bilinear sample is partly beyond, they share."""
+    k, ray = _pinhole(first, camera)
+    turned = torch.cat([ray, torch.ones_like(ray[..., :1])], 2) @ rotations.mT
+    seen = torch.cat([turned[..., :2] * zooms[:, None, None], turned[..., 2:]], 2)
+    second, within = _sample(torch.cat([second, torch.ones_like(second)], 1), seen @ k.mT).split(1, 1)
+    return second + (1 - within) * first
+
+
+def _pinhole(images, camera):
+    """(the camera's matrix, x / z and y / z of its pixels' rays [1, H W, 2])."""
+    height, width = images.shape[2:]
     device = images.device
     k = torch.tensor([[camera["fx"], 0, camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1]], device=device)
     v, u = torch.meshgrid(torch.arange(float(height), device=device), torch.arange(float(width), device=device),
                           indexing="ij")
-    ray = torch.stack([(u - camera["cx"]) / camera["fx"], (v - camera["cy"]) / camera["fy"]], -1).reshape(1, -1, 2)
-    ray = torch.cat([ray / zooms[:, None, None], torch.ones(count, height * width, 1, device=device)], 2)
-    source = ray @ (k @ rotations.mT).mT
-    # Behind the canonical camera it sees nothing; a pixel far away is none either.
+    return k, torch.stack([(u - camera["cx"]) / camera["fx"], (v - camera["cy"]) / camera["fy"]], -1).reshape(1, -1, 2)
+
+
+def _sample(images, source):
+    """`images` [N, C, H, W] at as many places `source` [N, H W, 3], pixels in homogeneous coordinates."""
+    count, _, height, width = images.shape
+    # Behind the camera it sees nothing; a pixel far away is none either.
     ahead = source[..., 2:] > 1e-3
     source = torch.where(ahead, source[..., :2] / source[..., 2:].clamp(min=1e-3), -1e4)
     # Pixel centres are whole numbers here; grid_sample's -1 and 1 are the image's outer edges.
-    grid = (2 * source + 1) / torch.tensor([width, height], device=device) - 1
+    grid = (2 * source + 1) / torch.tensor([width, height], device=images.device) - 1
     return torch.nn.functional.grid_sample(images, grid.reshape(count, height, width, 2), align_corners=False)
 
 
