@@ -11,13 +11,14 @@ use whereabot::gpu::{NetworkPlan, Precision};
 use whereabot::network::{Model, Network, Shape};
 use whereabot::reference;
 
-const NAMES: [&str; 7] = [
+const NAMES: [&str; 8] = [
     "tiny",
     "threshold",
     "tiny_f16",
     "context",
     "heatmap",
     "zoom",
+    "second_look",
     "arm",
 ];
 
@@ -109,14 +110,11 @@ fn the_overlay_agrees_with_pytorch() {
         let model = model(name);
         let shape = model.mask_network.input();
         let image = input(name, "mask.image", shape);
-        let mask = input(
-            name,
-            &format!(
-                "mask.{}",
-                model.mask_network.nodes().last().unwrap().layer.name
-            ),
-            model.mask_network.output(),
-        );
+        let mask = match model.description.second_look {
+            Some(_) => "merged".to_owned(),
+            None => last("mask", &model.mask_network),
+        };
+        let mask = input(name, &mask, model.mask_network.output());
         let (overlay, gaze) = reference::joint_input(&image, &mask, &model.description);
         let expected = golden(name, "joint.overlay");
         assert!(difference(overlay.data(), &expected).unwrap() <= 1e-5);
@@ -127,6 +125,37 @@ fn the_overlay_agrees_with_pytorch() {
         assert!(difference(&reference::zoom_joints(&joints, &gaze), &expected).unwrap() <= 1e-5);
         assert!(difference(&joints, &expected).unwrap() > 1e-2);
     }
+}
+
+#[test]
+fn the_second_look_agrees_with_pytorch() {
+    let name = "second_look";
+    let model = model(name);
+    let (network, camera) = (&model.mask_network, &model.description.camera);
+    let image = input(name, "mask.image", network.input());
+    let first = input(name, &last("mask", network), network.output());
+    let rules = model.description.second_look.unwrap();
+    let gaze = reference::zoom(&first, model.description.overlay, camera, rules);
+    let seen = reference::zoom_image(&image, camera, &gaze);
+    let apart = |found: &reference::Tensor, tensor: &str| {
+        difference(found.data(), &golden(name, tensor)).unwrap()
+    };
+    assert!(apart(&seen, "second.image") <= 1e-5);
+    assert!(apart(&image, "second.image") > 1e-2);
+    let closer = reference::run(network, &seen).unwrap();
+    assert!(apart(&closer, &last("second", network)) <= 1e-5);
+    // Negative controls: neither look alone is the mask.
+    for look in [&first, &closer] {
+        assert!(apart(look, "merged") > 1e-2);
+    }
+    let merged = reference::zoom_mask(&closer, &first, camera, &gaze);
+    assert!(apart(&merged, "merged") <= 1e-5);
+    assert!(apart(&reference::mask(&model, &image).unwrap(), "merged") <= 1e-5);
+}
+
+/// The tensor of the network's last layer.
+fn last(prefix: &str, network: &Network) -> String {
+    format!("{prefix}.{}", network.nodes().last().unwrap().layer.name)
 }
 
 #[test]

@@ -137,7 +137,7 @@ fn a_file_of_another_network_is_refused() {
 #[test]
 fn descriptions_that_mean_something_else_are_refused() {
     type Change = fn(&mut Value);
-    let changes: [(Change, &[&str]); 25] = [
+    let changes: [(Change, &[&str]); 26] = [
         (
             |d| d["version"] = json!(2),
             &["version: expected 1, found 2"],
