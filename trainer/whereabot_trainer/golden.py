@@ -176,7 +176,8 @@ def write_golden(folder, seed=1):
                 joint.dense.weight *= 0.02
                 joint.dense.bias[:] = torch.tensor(ARM_JOINTS)
         description = describe(
-            mask_layers, joint_layers, family=family, robot="golden", overlay=rule, zoom=view, second_look=second_look, arm=arm, width=width, height=height,
+            mask_layers, joint_layers, family=family, robot="golden", overlay=rule, zoom=view, second_look=second_look,
+            arm=arm, width=width, height=height,
             camera={"fx": 14.25, "fy": 14.25, "cx": (width - 1) / 2, "cy": (height - 1) / 2},
             presence={"mask_threshold": 0.5, "sure_threshold": 0.7, "min_sure": 0.01}, card=CARD)
         path = folder / f"{name}.safetensors"

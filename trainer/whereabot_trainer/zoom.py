@@ -12,7 +12,7 @@ from .networks import CAMERA, share
 
 # The picture's side spans so many standard deviations of the mask: nineteen arms in twenty are seen whole.
 ZOOM = {"spread": 5.0, "least": 0.5, "most": 4.0}
-# Of the mask network: what fills the picture already gains nothing by a smaller one, and masks are trained at sizes within this.
+# The mask network's: never out, and in no farther than the pictures that it is trained on are enlarged.
 SECOND_LOOK = {"spread": 5.0, "least": 1.0, "most": 2.0}
 
 
