@@ -227,9 +227,12 @@ def test_presence_rejects_images_without_a_robot_and_finds_the_most_robots():
     robots[0.9], without[0.9] = [0.07, 0.1, 0.2], [0.0] * 37 + [0.06, 0.3, 0.4]
     threshold, least = choose_presence(robots, without)
     assert threshold == 0.9 and 0.06 < least < 0.061
-    robots[0.95] = [0.09, 0.1, 0.2]
+    # All are found at both; there, they are farther from being missed.
+    robots[0.95] = [0.12, 0.13, 0.2]
     threshold, least = choose_presence(robots, without)
     assert threshold == 0.95 and 0.08 < least < 0.081
+    robots[0.95] = [0.09, 0.13, 0.2]
+    assert choose_presence(robots, without)[0] == 0.9
 
 
 def test_calibration_finds_the_best_threshold():

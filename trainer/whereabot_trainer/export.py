@@ -23,7 +23,7 @@ def choose_presence(robots, without, passing=0.05):
 
     `robots` and `without` give, for each T of SURE_THRESHOLDS, the shares of images with a robot and without one. For
     each T, S lets at most the share `passing` of the images without a robot pass; of these pairs, it is the one that
-    lets the most robots pass.
+    lets the most robots pass and, where several do, the one whose S robots pass by most, but for one in a hundred.
     """
     choices = []
     for threshold in SURE_THRESHOLDS:
@@ -31,8 +31,10 @@ def choose_presence(robots, without, passing=0.05):
         highest = shares[int(passing * len(shares))] if len(shares) else 0.0
         # Below a thousandth of the image (54 pixels) nothing can be said about a robot's joints.
         least = max(0.001, math.ceil(highest * 1e4 + 0.5) / 1e4)
-        choices.append((float((np.asarray(robots[threshold]) >= least).mean()), threshold, least))
-    _, threshold, least = max(choices)
+        seen = np.asarray(robots[threshold])
+        margin = float(np.quantile(seen, 0.01)) / least if len(seen) else 0.0
+        choices.append((float((seen >= least).mean()), margin, threshold, least))
+    *_, threshold, least = max(choices)
     return threshold, least
 
 
