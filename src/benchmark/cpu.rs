@@ -10,7 +10,7 @@ use super::{
 use crate::camera::Rectification;
 use crate::cascade::LocateError;
 use crate::gpu::{Precision, Work};
-use crate::network::{Model, Network, Node, Shape, Source};
+use crate::network::{Model, Network, Node, Overlay, Shape, Source};
 use crate::reference;
 
 pub(super) fn measure(
@@ -138,7 +138,7 @@ fn layer_times(
     let mut mask = look(&image, &mut lap)?;
     if let Some(rules) = description.second_look {
         let camera = &description.camera;
-        let gaze = reference::zoom(&mask, description.overlay, camera, rules);
+        let gaze = reference::zoom(&mask, Overlay::Multiply {}, camera, rules);
         let seen = reference::zoom_image(&image, camera, &gaze);
         lap();
         let closer = look(&seen, &mut lap)?;

@@ -105,10 +105,10 @@ impl Plan {
                 None,
                 &mut planned,
             )?;
-            let (rule, camera) = (description.overlay, description.camera);
-            let second_look = description.second_look.map(|zoom| {
-                SecondLook::new(device, &mask, (&image, &looked_at), camera, (zoom, rule))
-            });
+            let camera = description.camera;
+            let second_look = description
+                .second_look
+                .map(|zoom| SecondLook::new(device, &mask, (&image, &looked_at), camera, zoom));
             let second_look = second_look.transpose()?;
             let masked =
                 NetworkPlan::input(device, layout, "overlay", &model.joint_network, batch)?;
@@ -130,6 +130,7 @@ impl Plan {
             let thresholds = (presence.mask_threshold, presence.sure_threshold);
             let runs = storage_buffer(device, "coverage: runs", size_of::<u32>() as u64)?;
             let coverage = coverage(device, output, &totals, &runs, thresholds)?;
+            let rule = description.overlay;
             let seen = joint.output();
             let joints = || Tensor::in_layout(device, layout, "joints", seen.shape, batch, 0);
             let mut behind: Vec<Behind> = Vec::new();

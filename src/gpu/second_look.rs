@@ -17,8 +17,8 @@ pub(super) struct SecondLook {
 }
 
 impl SecondLook {
-    /// Of `network`, which reads `input`, at `image` of the same shape, turned by `zoom` to what the overlay's `rule` shows by its
-    /// mask. Driver errors reach the caller's [`Device::scoped`].
+    /// Of `network`, which reads `input`, at `image` of the same shape, turned by `zoom` to its mask, each pixel as heavy as it
+    /// is probable: a share of it that rose steeply would turn the camera by roundings. Driver errors reach the caller's [`Device::scoped`].
     ///
     /// # Errors
     /// Images too large or too many for the adapter's limits.
@@ -27,7 +27,7 @@ impl SecondLook {
         network: &NetworkPlan,
         (image, input): (&Tensor, &Tensor),
         canonical: Intrinsics,
-        (zoom, rule): (Zoom, Overlay),
+        zoom: Zoom,
     ) -> Result<Self, GpuError> {
         let found = network.output();
         let plane = |what| {
@@ -49,7 +49,7 @@ impl SecondLook {
                 .zoom_image(device, found, &first)?
                 .labelled("first.zoom_image"),
             gazes
-                .zoom(device, &first, zoom, rule)?
+                .zoom(device, &first, zoom, Overlay::Multiply {})?
                 .labelled("second.zoom"),
             gazes
                 .zoom_image(device, image, input)?

@@ -2,7 +2,7 @@ use super::{
     Gaze, Tensor, kinematic_fit, overlay, run, zoom, zoom_image, zoom_joints, zoom_mask,
     zoom_overlay,
 };
-use crate::network::{Description, Model};
+use crate::network::{Description, Model, Overlay};
 
 /// The mask of the robot in `image`: the mask network's, of the second look too where `model` takes one. `None` where the
 /// image is not what the network takes.
@@ -13,7 +13,7 @@ pub fn mask(model: &Model, image: &Tensor) -> Option<Tensor> {
         return Some(first);
     };
     let camera = &description.camera;
-    let gaze = zoom(&first, description.overlay, camera, rules);
+    let gaze = zoom(&first, Overlay::Multiply {}, camera, rules);
     let closer = run(network, &zoom_image(image, camera, &gaze))?;
     Some(zoom_mask(&closer, &first, camera, &gaze))
 }

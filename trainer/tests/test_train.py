@@ -360,8 +360,7 @@ def test_a_model_file_is_exported_again_with_the_second_look_of_its_family(train
 def test_calibration_is_of_both_looks(train, recording, tmp_path, monkeypatch):
     steps = ["--iterations", "1", "--validation-samples", "4", "--family", "context"]
     mask, joint = train("train-mask", "mask", *steps, "--crop", "32", "24"), train("train-joint", "joint", *steps)
-    shifts = {None: -2.0, (("spread", 5.0), ("least", 1.0), ("most", 2.0)): 0.3}
-    monkeypatch.setattr(evaluate, "calibrate", lambda *given: shifts[tuple(given[4][0].items()) if len(given) > 4 else None])
+    monkeypatch.setattr(evaluate, "calibrate", lambda *given: {4: -2.0, 5: 0.3 if given[-1] == zoom.SECOND_LOOK else 0}[len(given)])
     main(["export", "--mask", str(mask), "--joint", str(joint), "--validation", str(recording), "--validation-samples", "10",
           "--out", str(tmp_path / "out"), "--cache", str(tmp_path / "cache")])
     network, _, description = read_model(tmp_path / "out")
@@ -374,17 +373,17 @@ def test_calibration_is_of_both_looks(train, recording, tmp_path, monkeypatch):
 def test_joints_are_trained_behind_what_export_s_masks_will_be(train, monkeypatch, family):
     masks_of, seen = evaluate.masks_of, []
 
-    def spy(network, images, looks=None, bf16=False):
-        seen.append((looks, bf16))
-        return masks_of(network, images, looks, bf16)
+    def spy(network, images, second_look=None, bf16=False):
+        seen.append((second_look, bf16))
+        return masks_of(network, images, second_look, bf16)
 
     mask_run = train("train-mask", "mask", "--iterations", "1", "--validation-samples", "4", "--crop", "32", "24", "--family", family)
     monkeypatch.setattr(evaluate, "masks_of", spy)
     train("train-joint", "joint", "--iterations", "1", "--validation-samples", "4", "--mask-run", str(mask_run),
           "--estimated-masks", "1", "--family", "context")
-    looks = (zoom.SECOND_LOOK, OVERLAYS["ramp"]) if family == "context" else None
+    second_look = zoom.SECOND_LOOK if family == "context" else None
     # Those that are trained on in bfloat16, those that the log tells of not.
-    assert set(map(repr, seen)) == {repr((looks, True)), repr((looks, False))}
+    assert set(map(repr, seen)) == {repr((second_look, True)), repr((second_look, False))}
 
 
 def test_several_runs_are_exported_as_the_mean_of_their_weights(train, recording, tmp_path):

@@ -130,13 +130,12 @@ class _Bright(torch.nn.Module):
         return images[:, :1].sigmoid() * 0.8
 
 
-def test_with_nothing_to_look_at_the_second_look_is_the_first():
+def test_of_what_is_alike_everywhere_the_second_look_is_the_first():
     torch.manual_seed(0)
     images = torch.rand(2, 3, INPUT_HEIGHT, INPUT_WIDTH)
-    images[0] -= 5
+    images[0] = 0.5
     images[1, :, 60:100, 30:90] += 5
-    looks = zoom.SECOND_LOOK, OVERLAYS["ramp"]
-    once, twice = evaluate.masks_of(_Bright(), images), evaluate.masks_of(_Bright(), images, looks)
-    assert once[0].max() < OVERLAYS["ramp"]["low"] and torch.allclose(once[0], twice[0], atol=1e-4)
+    once, twice = (evaluate.masks_of(_Bright(), images, second_look) for second_look in (None, zoom.SECOND_LOOK))
+    assert torch.allclose(once[0], twice[0], atol=1e-4)
     # Where there is something, it is looked at.
     assert not torch.allclose(once[1], twice[1], atol=0.1)

@@ -71,8 +71,7 @@ def export_runs(args):
     joint, joint_state, joint_mean = _mean_of(args.joint) if not joint_file else (read_model(joint_file)[1], None, {})
     mask_card, joint_card = _mask_card(args.mask[-1]), _joint_card(args.joint[-1])
     family, rules = mask_card["mask_training"]["family"], (joint_card["overlay"], joint_card["zoom"])
-    looks = zoom.looks_of(family, rules[0])
-    second_look = looks and looks[0]
+    second_look = zoom.second_look_of(family)
 
     samples = data.Samples(args.validation or args.recording, args.cache, joint_card["arm_lengths"])
     robots = sorted(set(samples.robots))
@@ -103,13 +102,13 @@ def export_runs(args):
     if not mask_file:
         shift = evaluate.calibrate(mask, samples, chosen[own[chosen]], args.device)
         evaluate.shift_logits(mask, shift)
-        if looks:
+        if second_look:
             # Only a calibrated first look tells where the second one is to be.
-            more = evaluate.calibrate(mask, samples, chosen[own[chosen]], args.device, looks)
+            more = evaluate.calibrate(mask, samples, chosen[own[chosen]], args.device, second_look)
             evaluate.shift_logits(mask, more)
             shift = round(shift + more, 3)
         mask_card["calibration"]["logit_shift"] = shift
-    estimated = evaluate.estimate_masks(mask, samples, order, args.device, looks)
+    estimated = evaluate.estimate_masks(mask, samples, order, args.device, second_look)
     seen = samples.has_robot & (samples.coverage >= joint_card["min_coverage"])
     empty = samples.coverage == 0
 
@@ -141,7 +140,7 @@ def export_runs(args):
             unfitted = "joints are not those of an arm of Universal Robots' kind"
 
     shown = reported[seen[reported]]
-    measured = evaluate.score_mask(mask, samples, reported, args.device, looks=looks)
+    measured = evaluate.score_mask(mask, samples, reported, args.device, second_look=second_look)
     figures = {name: measured[name] for name in ("accuracy", "iou", "precision", "recall")}
     for name, masks in (("true_mask", None), ("estimated_mask", estimated)):
         figures |= evaluate.score_joints(

@@ -126,7 +126,7 @@ def cascade_activations(mask, joint, description, image):
     values = {f"mask.{name}": value[0] for name, value in mask.activations(image[None]).items()}
     estimate = values["mask.mask"][None]
     if "second_look" in description:
-        cameras = zoom.look_at(estimate, description["second_look"], description["overlay"], description["camera"])
+        cameras = zoom.look_at(estimate, description["second_look"], zoom.LOOKED_AT, description["camera"])
         second = mask.activations(zoom.see(image[None], *cameras, description["camera"]))
         values |= {f"second.{name}": value[0] for name, value in second.items()}
         estimate = zoom.merge(estimate, second["mask"], *cameras, description["camera"])
@@ -158,7 +158,7 @@ def write_golden(folder, seed=1):
     heatmap = (MASK_LAYERS, HEATMAP_LAYERS, WIDTH, HEIGHT)
     # The mask is spread over the whole small image: this looks at the middle half of it.
     view = {"spread": 2.0, "least": 0.5, "most": 4.0}
-    # What of the mask is above one half lies to one side: the second look is beside the middle and sees half of the image.
+    # Half of the image is beyond the second look; the joint network's is beside the middle.
     second_look, beside = {"spread": 2.0, "least": 1.0, "most": 4.0}, {"rule": "ramp", "low": 0.5, "high": 0.9}
     for name, family, (mask_layers, joint_layers, width, height), rule, second_look, view, arm, dtype in (
         ("tiny", "paper", paper, multiply, None, None, None, "f32"),

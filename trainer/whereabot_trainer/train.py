@@ -511,13 +511,13 @@ def train_joint(args):
         card |= {"init_from": Path(args.init_from).name}
     network = network.to(args.device, memory_format=torch.channels_last)
 
-    mask_network = looks = held_out_estimated = None
+    mask_network = second_look = held_out_estimated = None
     if args.mask_run:
         mask_network, mask_family = load_mask(args.mask_run)
         mask_network = mask_network.to(args.device, memory_format=torch.channels_last)
         # As export will have it, whatever a model file had.
-        looks = zoom.looks_of(mask_family, rule)
-        held_out_estimated = evaluate.estimate_masks(mask_network, held_out, validation, args.device, looks)
+        second_look = zoom.second_look_of(mask_family)
+        held_out_estimated = evaluate.estimate_masks(mask_network, held_out, validation, args.device, second_look)
     elif args.estimated_masks > 0:
         raise SystemExit("--estimated-masks needs --mask-run")
 
@@ -527,7 +527,7 @@ def train_joint(args):
         images = data.jitter_some_colours(images)
         rows = torch.rand(len(batch)) < (args.estimated_masks if progress >= args.estimated_after else 0)
         if rows.any():
-            estimates = evaluate.masks_of(mask_network, images[rows], looks, args.precision == "bf16")
+            estimates = evaluate.masks_of(mask_network, images[rows], second_look, args.precision == "bf16")
             moved = torch.rand(len(estimates)) < data.VARIED
             if moved.any():
                 estimates[moved] = data.jitter_masks(estimates[moved])
