@@ -48,6 +48,13 @@ fn sample_of(ray: vec3<f32>, zoom: f32, size: vec2<f32>) -> Sample {
     );
 }
 
+fn sampled_input(plane: u32, s: Sample) -> vec4<f32> {
+    return input_at(plane, s.low.y, s.low.x) * s.weights.x
+        + input_at(plane, s.low.y, s.high.x) * s.weights.y
+        + input_at(plane, s.high.y, s.low.x) * s.weights.z
+        + input_at(plane, s.high.y, s.high.x) * s.weights.w;
+}
+
 // Where pixel (x, y) of this camera looks, in the canonical camera's frame.
 fn canonical_ray(gaze: Gaze, x: u32, y: u32) -> vec3<f32> {
     let pixel = vec2(f32(x), f32(y));

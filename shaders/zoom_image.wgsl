@@ -22,9 +22,5 @@ fn main(
     }
     let size = vec2(f32(INPUT_WIDTH), f32(INPUT_HEIGHT));
     let s = sample_of(canonical_ray(gaze, place.x, place.y), 1.0, size);
-    let value = input_at(place.plane, s.low.y, s.low.x) * s.weights.x
-        + input_at(place.plane, s.low.y, s.high.x) * s.weights.y
-        + input_at(place.plane, s.high.y, s.low.x) * s.weights.z
-        + input_at(place.plane, s.high.y, s.high.x) * s.weights.w;
-    output_set(place.plane, place.y, place.x, value);
+    output_set(place.plane, place.y, place.x, sampled_input(place.plane, s));
 }

@@ -19,10 +19,7 @@ fn main(
     let pixel = vec2(f32(place.x), f32(place.y));
     let ray = turned(gaze, vec3((pixel - vec2(CX, CY)) / vec2(FX, FY), 1.0));
     let s = sample_of(ray, gaze.right.w, vec2(f32(INPUT_WIDTH), f32(INPUT_HEIGHT)));
-    let closer = input_at(place.plane, s.low.y, s.low.x) * s.weights.x
-        + input_at(place.plane, s.low.y, s.high.x) * s.weights.y
-        + input_at(place.plane, s.high.y, s.low.x) * s.weights.z
-        + input_at(place.plane, s.high.y, s.high.x) * s.weights.w;
+    let closer = sampled_input(place.plane, s);
     let beyond = 1.0 - dot(s.weights, vec4(1.0));
     output_set(place.plane, place.y, place.x, closer + beyond * second_at(place.plane, place.y, place.x));
 }

@@ -18,13 +18,9 @@ fn main(
     }
     let size = vec2(f32(INPUT_WIDTH), f32(INPUT_HEIGHT));
     let s = sample_of(canonical_ray(gazes[place.plane], place.x, place.y), 1.0, size);
-    let colour = input_at(place.plane, s.low.y, s.low.x) * s.weights.x
-        + input_at(place.plane, s.low.y, s.high.x) * s.weights.y
-        + input_at(place.plane, s.high.y, s.low.x) * s.weights.z
-        + input_at(place.plane, s.high.y, s.high.x) * s.weights.w;
     let probability = second_at(place.plane, s.low.y, s.low.x).x * s.weights.x
         + second_at(place.plane, s.low.y, s.high.x).x * s.weights.y
         + second_at(place.plane, s.high.y, s.low.x).x * s.weights.z
         + second_at(place.plane, s.high.y, s.high.x).x * s.weights.w;
-    output_set(place.plane, place.y, place.x, colour * shown(probability));
+    output_set(place.plane, place.y, place.x, sampled_input(place.plane, s) * shown(probability));
 }

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use common::{difference, with_one_weight_changed};
 use safetensors::SafeTensors;
 use whereabot::gpu::{NetworkPlan, Precision};
-use whereabot::network::{Model, Network, Overlay, Shape};
+use whereabot::network::{Model, Network, Shape};
 use whereabot::reference;
 
 const NAMES: [&str; 8] = [
@@ -134,9 +134,7 @@ fn the_second_look_agrees_with_pytorch() {
     let (network, camera) = (&model.mask_network, &model.description.camera);
     let image = input(name, "mask.image", network.input());
     let first = input(name, &last("mask", network), network.output());
-    let rules = model.description.second_look.unwrap();
-    let gaze = reference::zoom(&first, Overlay::Multiply {}, camera, rules);
-    let seen = reference::zoom_image(&image, camera, &gaze);
+    let (seen, gaze) = reference::second_look(&image, &first, &model.description).unwrap();
     let apart = |found: &reference::Tensor, tensor: &str| {
         difference(found.data(), &golden(name, tensor)).unwrap()
     };

@@ -10,7 +10,7 @@ use super::{
 use crate::camera::Rectification;
 use crate::cascade::LocateError;
 use crate::gpu::{Precision, Work};
-use crate::network::{Model, Network, Node, Overlay, Shape, Source};
+use crate::network::{Model, Network, Node, Shape, Source};
 use crate::reference;
 
 pub(super) fn measure(
@@ -136,13 +136,10 @@ fn layer_times(
             .ok_or(LocateError::Shape("mask network"))
     };
     let mut mask = look(&image, &mut lap)?;
-    if let Some(rules) = description.second_look {
-        let camera = &description.camera;
-        let gaze = reference::zoom(&mask, Overlay::Multiply {}, camera, rules);
-        let seen = reference::zoom_image(&image, camera, &gaze);
+    if let Some((seen, gaze)) = reference::second_look(&image, &mask, description) {
         lap();
         let closer = look(&seen, &mut lap)?;
-        mask = reference::zoom_mask(&closer, &mask, camera, &gaze);
+        mask = reference::zoom_mask(&closer, &mask, &description.camera, &gaze);
         lap();
     }
     let presence = description.presence;

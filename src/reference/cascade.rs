@@ -9,13 +9,28 @@ use crate::network::{Description, Model, Overlay};
 pub fn mask(model: &Model, image: &Tensor) -> Option<Tensor> {
     let (network, description) = (&model.mask_network, &model.description);
     let first = run(network, image)?;
-    let Some(rules) = description.second_look else {
+    let Some((closer, gaze)) = second_look(image, &first, description) else {
         return Some(first);
     };
+    let closer = run(network, &closer)?;
+    Some(zoom_mask(&closer, &first, &description.camera, &gaze))
+}
+
+/// The mask network's input when it looks again, at what its `first` mask of `image` shows, and where it looks from. `None` where
+/// `description` asks for one look.
+pub fn second_look(
+    image: &Tensor,
+    first: &Tensor,
+    description: &Description,
+) -> Option<(Tensor, Gaze)> {
     let camera = &description.camera;
-    let gaze = zoom(&first, Overlay::Multiply {}, camera, rules);
-    let closer = run(network, &zoom_image(image, camera, &gaze))?;
-    Some(zoom_mask(&closer, &first, camera, &gaze))
+    let gaze = zoom(
+        first,
+        Overlay::Multiply {},
+        camera,
+        description.second_look?,
+    );
+    Some((zoom_image(image, camera, &gaze), gaze))
 }
 
 /// The joint network's input, and where it looks from unless that is the canonical camera: the overlay of `image` and

@@ -159,7 +159,7 @@ def write_golden(folder, seed=1):
     # The mask is spread over the whole small image: this looks at the middle half of it.
     view = {"spread": 2.0, "least": 0.5, "most": 4.0}
     # Half of the image is beyond the second look; the joint network's is beside the middle.
-    second_look, beside = {"spread": 2.0, "least": 1.0, "most": 4.0}, {"rule": "ramp", "low": 0.5, "high": 0.9}
+    closer, beside = {"spread": 2.0, "least": 1.0, "most": 4.0}, {"rule": "ramp", "low": 0.5, "high": 0.9}
     for name, family, (mask_layers, joint_layers, width, height), rule, second_look, view, arm, dtype in (
         ("tiny", "paper", paper, multiply, None, None, None, "f32"),
         ("threshold", "paper", paper, threshold, None, None, None, "f32"),
@@ -167,7 +167,7 @@ def write_golden(folder, seed=1):
         ("context", "context", context, multiply, None, None, None, "f32"),
         ("heatmap", "context", heatmap, multiply, None, None, None, "f32"),
         ("zoom", "context", heatmap, ramp, None, view, None, "f32"), ("arm", "paper", paper, multiply, None, None, ARM, "f32"),
-        ("second_look", "context", heatmap, beside, second_look, view, None, "f32"),
+        ("second_look", "context", heatmap, beside, closer, view, None, "f32"),
     ):
         image = torch.rand((3, height, width), generator=torch.Generator().manual_seed(seed))
         mask, joint = _networks(seed, image, mask_layers, joint_layers)
