@@ -61,7 +61,7 @@ enum Activation {
     Sigmoid,
 }
 
-#[derive(Deserialize)]
+#[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(tag = "op")]
 enum Operation {
     #[serde(rename = "conv2d")]
