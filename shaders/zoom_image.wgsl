@@ -14,13 +14,7 @@ fn main(
     if place.plane >= OUTPUT_PLANES {
         return;
     }
-    let gaze = gazes[place.plane];
-    // Through the canonical camera itself it stays as it is, to the last bit.
-    if gaze.right.w == 1.0 && gaze.ahead.z == 1.0 {
-        output_set(place.plane, place.y, place.x, input_at(place.plane, place.y, place.x));
-        return;
-    }
     let size = vec2(f32(INPUT_WIDTH), f32(INPUT_HEIGHT));
-    let s = sample_of(canonical_ray(gaze, place.x, place.y), 1.0, size);
+    let s = sample_of(canonical_ray(gazes[place.plane], place.x, place.y), 1.0, size);
     output_set(place.plane, place.y, place.x, sampled_input(place.plane, s));
 }

@@ -8,7 +8,7 @@ mod known;
 
 use std::path::Path;
 
-use common::{description, model_file};
+use common::{coarse, description, model_file};
 use image::RgbaImage;
 use known::{XYZ, command, model};
 use serde_json::{Value, json};
@@ -299,11 +299,19 @@ fn without_timestamps_the_wall_clock_is_used_and_named() {
 
 #[test]
 fn a_plan_hands_out_its_steps_in_order_with_all_their_work() {
-    let model = Model::from_bytes(&model_file(&description(32, 24, 4), 1), "random").unwrap();
+    let mut description = description(32, 24, 4);
+    description["coarse"] = coarse(json!({"spread": 5, "least": 1, "most": 2}));
+    let model = Model::from_bytes(&model_file(&description, 1), "random").unwrap();
     let device = common::device();
     let mut plan = Plan::new(&device, &model, 3, Precision::F32).unwrap();
     // What rectifies is made for the kind of source.
-    assert_eq!(plan.steps(true).next().unwrap().label(), "mask.conv1");
+    assert!(
+        plan.steps(true)
+            .next()
+            .unwrap()
+            .label()
+            .starts_with("coarse.conv1")
+    );
     let camera = Camera::from_hfov(40, 30, 1.0);
     let params = Rectification::new(&camera, &model.description.camera, 32, 24);
     for index in 0..3 {
@@ -316,7 +324,8 @@ fn a_plan_hands_out_its_steps_in_order_with_all_their_work() {
         } else {
             0
         };
-        model.mask_network.macs() + joint
+        let coarse = model.coarse_network.as_ref().unwrap().macs();
+        coarse + model.mask_network.macs() + joint
     };
     for joints in [false, true] {
         let operations: u64 = plan.steps(joints).map(|s| s.work().operations).sum();
@@ -324,7 +333,10 @@ fn a_plan_hands_out_its_steps_in_order_with_all_their_work() {
     }
     let mut labels: Vec<_> = plan.steps(true).map(|step| step.label()).collect();
     labels.dedup();
-    assert_eq!(labels[..2], ["rectify", "mask.conv1"]);
+    assert_eq!(labels[0], "rectify");
+    let at = |label| labels.iter().position(|l| *l == label).unwrap();
+    assert_eq!(at("coarse.zoom_image") + 1, at("mask.conv1"));
+    assert_eq!(at("mask.conv5") + 1, at("zoom_mask"));
     assert_eq!(labels[labels.len() - 2..], ["joint.dense", "coverage"]);
     assert_eq!(plan.steps(false).last().unwrap().label(), "coverage");
 }

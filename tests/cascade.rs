@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{Driver, description, device, difference, driver, joints, model_file, noise};
+use common::{Driver, coarse, description, device, difference, driver, joints, model_file, noise};
 use image::RgbaImage;
 use whereabot::camera::{Camera, Rectification};
 use whereabot::cascade::{
@@ -19,16 +19,24 @@ const ALL: Output = Output {
 };
 
 /// The keys of a description that turn a network's camera.
-const LOOKS: [&str; 2] = ["second_look", "zoom"];
+const LOOKS: [&str; 2] = ["coarse", "zoom"];
 
 /// A random model that finds a robot in everything, so that there are joints to compare; with these [`LOOKS`].
 fn model(seed: u64, looks: &[&str]) -> Model {
-    let mut description = description(256, 212, 32);
+    let mut description = looking(description(256, 212, 32), looks);
     description["presence"]["min_sure"] = 0.0.into();
-    for &look in looks {
-        description[look] = zoomed();
-    }
     Model::from_bytes(&model_file(&description, seed), "random").unwrap()
+}
+
+/// `description` with these [`LOOKS`].
+fn looking(mut description: serde_json::Value, looks: &[&str]) -> serde_json::Value {
+    for &look in looks {
+        description[look] = match look {
+            "coarse" => coarse(zoomed()),
+            _ => zoomed(),
+        };
+    }
+    description
 }
 
 /// A random mask covers half of everywhere: near enough to show something else than the image.
@@ -98,11 +106,8 @@ fn another_picture_is_noticed() {
 
 #[test]
 fn a_batch_gives_what_single_images_give() {
-    let mut description = description(48, 40, 5);
-    for looks in [serde_json::Value::Null, zoomed()] {
-        for look in LOOKS {
-            description[look] = looks.clone();
-        }
+    for looks in [&[][..], &LOOKS] {
+        let description = looking(description(48, 40, 5), looks);
         let model = Model::from_bytes(&model_file(&description, 4), "random").unwrap();
         gives_what_single_images_give(&model);
     }
@@ -270,11 +275,11 @@ fn a_mask_that_is_no_number_is_not_a_robot() {
 fn a_zoomed_network_sees_something_else() {
     let image = picture(512, 424, 3);
     let camera = Camera::from_hfov(512, 424, 70_f64.to_radians());
-    let [plain, twice, zoomed] = [&[][..], &["second_look"], &["zoom"]].map(|looks| {
+    let [plain, closer, zoomed] = [&[][..], &["coarse"], &["zoom"]].map(|looks| {
         let mut locator = Locator::on_gpu(device(), &model(3, looks), Precision::F32).unwrap();
         locator.locate(&image, &camera, ALL).unwrap()
     });
-    assert!(difference(mask(&plain), mask(&twice)).unwrap() > 1e-2);
+    assert!(difference(mask(&plain), mask(&closer)).unwrap() > 1e-2);
     assert_eq!(mask(&plain), mask(&zoomed));
     assert!(difference(&joints(&plain), &joints(&zoomed)).unwrap() > 1e-3);
 }

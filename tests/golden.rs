@@ -18,7 +18,7 @@ const NAMES: [&str; 8] = [
     "context",
     "heatmap",
     "zoom",
-    "second_look",
+    "coarse",
     "arm",
 ];
 
@@ -61,11 +61,20 @@ fn greatest(network: &Network, name: &str, prefix: &str, source: &str) -> f32 {
 #[test]
 fn every_layer_of_the_reference_agrees_with_pytorch() {
     for name in NAMES {
-        let model = model(name);
-        let mask = greatest(&model.mask_network, name, "mask", "image");
-        let joint = greatest(&model.joint_network, name, "joint", "overlay");
-        assert!(mask <= 1e-5 && joint <= 1e-5, "{name}: {mask}, {joint}");
+        for (network, prefix, source) in networks(&model(name)) {
+            let difference = greatest(network, name, prefix, source);
+            assert!(difference <= 1e-5, "{name}: {prefix}: {difference}");
+        }
     }
+}
+
+/// Each with its tensors' prefix and its input's name.
+fn networks(model: &Model) -> Vec<(&Network, &'static str, &'static str)> {
+    let coarse = model.coarse_network.iter();
+    let mut networks: Vec<_> = coarse.map(|network| (network, "coarse", "image")).collect();
+    networks.push((&model.mask_network, "mask", "image"));
+    networks.push((&model.joint_network, "joint", "overlay"));
+    networks
 }
 
 #[test]
@@ -109,11 +118,11 @@ fn the_overlay_agrees_with_pytorch() {
     for name in NAMES {
         let model = model(name);
         let shape = model.mask_network.input();
-        let image = input(name, "mask.image", shape);
-        let mask = match model.description.second_look {
-            Some(_) => "merged".to_owned(),
-            None => last("mask", &model.mask_network),
+        let (image, mask) = match model.coarse_network {
+            Some(_) => ("coarse.image", "merged".to_owned()),
+            None => ("mask.image", last("mask", &model.mask_network)),
         };
+        let image = input(name, image, shape);
         let mask = input(name, &mask, model.mask_network.output());
         let (overlay, gaze) = reference::joint_input(&image, &mask, &model.description);
         let expected = golden(name, "joint.overlay");
@@ -128,25 +137,27 @@ fn the_overlay_agrees_with_pytorch() {
 }
 
 #[test]
-fn the_second_look_agrees_with_pytorch() {
-    let name = "second_look";
+fn what_a_coarse_mask_turns_agrees_with_pytorch() {
+    let name = "coarse";
     let model = model(name);
     let (network, camera) = (&model.mask_network, &model.description.camera);
-    let image = input(name, "mask.image", network.input());
-    let first = input(name, &last("mask", network), network.output());
-    let (seen, gaze) = reference::second_look(&image, &first, &model.description).unwrap();
+    let coarse = model.coarse_network.as_ref().unwrap();
+    let zoom = model.description.coarse.as_ref().unwrap().zoom;
+    let image = input(name, "coarse.image", coarse.input());
+    let coarse = input(name, &last("coarse", coarse), coarse.output());
+    let (seen, gaze) = reference::mask_input(&image, &coarse, camera, zoom);
     let apart = |found: &reference::Tensor, tensor: &str| {
         difference(found.data(), &golden(name, tensor)).unwrap()
     };
-    assert!(apart(&seen, "second.image") <= 1e-5);
-    assert!(apart(&image, "second.image") > 1e-2);
+    assert!(apart(&seen, "mask.image") <= 1e-5);
+    assert!(apart(&image, "mask.image") > 1e-2);
     let closer = reference::run(network, &seen).unwrap();
-    assert!(apart(&closer, &last("second", network)) <= 1e-5);
-    // Negative controls: neither look alone is the mask.
-    for look in [&first, &closer] {
-        assert!(apart(look, "merged") > 1e-2);
+    assert!(apart(&closer, &last("mask", network)) <= 1e-5);
+    // Negative controls: neither alone is the mask.
+    for mask in [&coarse, &closer] {
+        assert!(apart(mask, "merged") > 1e-2);
     }
-    let merged = reference::zoom_mask(&closer, &first, camera, &gaze);
+    let merged = reference::zoom_mask(&closer, &coarse, camera, &gaze);
     assert!(apart(&merged, "merged") <= 1e-5);
     assert!(apart(&reference::mask(&model, &image).unwrap(), "merged") <= 1e-5);
 }
@@ -175,11 +186,7 @@ fn every_layer_of_the_gpu_agrees_with_pytorch() {
     let device = common::device();
     for name in NAMES {
         let model = model(name);
-        let networks = [
-            (&model.mask_network, "mask", "image"),
-            (&model.joint_network, "joint", "overlay"),
-        ];
-        for (network, prefix, source) in networks {
+        for (network, prefix, source) in networks(&model) {
             let input = NetworkPlan::input(
                 &device,
                 device.layout(Precision::F32).unwrap(),

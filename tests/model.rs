@@ -3,7 +3,7 @@
 
 mod common;
 
-use common::{cases, description, model_file};
+use common::{cases, coarse, description, model_file};
 use proptest::prelude::*;
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
@@ -135,6 +135,19 @@ fn a_file_of_another_network_is_refused() {
 }
 
 #[test]
+fn a_coarse_mask_of_another_size_is_named() {
+    let mut description = small();
+    description["coarse"] = coarse(json!({"spread": 5, "least": 1, "most": 2}));
+    let model = Model::from_bytes(&model_file(&description, 1), "robot.safetensors").unwrap();
+    assert_eq!(model.networks().count(), 3);
+    description["coarse"]["network"]["layers"][3]["scale"] = json!(2);
+    assert_says(
+        &refusal(&model_file(&description, 1)),
+        &["coarse.network", "[1, 16, 24]", "[1, 8, 12]"],
+    );
+}
+
+#[test]
 fn descriptions_that_mean_something_else_are_refused() {
     type Change = fn(&mut Value);
     let changes: [(Change, &[&str]); 26] = [
@@ -197,8 +210,8 @@ fn descriptions_that_mean_something_else_are_refused() {
             &["zoom", "least 5", "most 4"],
         ),
         (
-            |d| d["second_look"] = json!({"spread": 5, "least": 1, "most": 200}),
-            &["second_look", "0.01", "most 200"],
+            |d| d["coarse"] = coarse(json!({"spread": 5, "least": 1, "most": 200})),
+            &["coarse.zoom", "0.01", "most 200"],
         ),
         (
             |d| d["zoom"] = json!({"spread": 5, "least": 0.5}),

@@ -213,7 +213,7 @@ fn what_the_canonical_camera_sees_stays_as_it_is() {
     let (image, seen) = (noise(shape.len(), 1), noise(3 * JOINTS, 3));
     let nothing = vec![0.0; shape.height * shape.width];
     let [(_, zoomed), (_, merged), ..] = run(&image, &nothing, &seen, shape, RAMP);
-    assert_eq!(zoomed, image);
+    assert!(difference(&zoomed, &image).unwrap() <= 1e-4);
     assert!(difference(&merged, &closer(&image, shape)).unwrap() <= 1e-4);
     // Negative control: one pixel turns the camera.
     let mut mask = nothing;

@@ -25,12 +25,13 @@ def read_model(path):
 
 
 def networks_alone(path, copy):
-    """Copies a model file, but for what makes the mask network look again, turns the joint network's camera and fits its joints to an
-    arm: peers run the networks, each once, which cost the same."""
+    """Copies a model file, but for what turns the networks' cameras and fits joints to an arm: peers run the mask network and the joint
+    network."""
     with safe_open(path, framework="numpy") as file:
-        metadata, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}
+        metadata, tensors = file.metadata(), {
+            key: file.get_tensor(key) for key in file.keys() if not key.startswith("coarse.")}
     description = json.loads(metadata["whereabot"])
-    for part in ("second_look", "zoom", "arm"):
+    for part in ("coarse", "zoom", "arm"):
         description.pop(part, None)
     save_file(tensors, copy, metadata | {"whereabot": json.dumps(description)})
 

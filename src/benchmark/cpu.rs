@@ -130,26 +130,33 @@ fn layer_times(
     let image = reference::rectify(image, rectification, shape.height, shape.width);
     lap();
     let description = &model.description;
-    let look = |image: &reference::Tensor, lap: &mut dyn FnMut()| {
-        reference::run_each(&model.mask_network, image, |_| lap())
-            .and_then(|mut outputs| outputs.pop())
-            .ok_or(LocateError::Shape("mask network"))
+    let run = |network, image: &reference::Tensor, lap: &mut dyn FnMut()| {
+        reference::run_each(network, image, |_| lap()).and_then(|mut outputs| outputs.pop())
     };
-    let mut mask = look(&image, &mut lap)?;
-    if let Some((seen, gaze)) = reference::second_look(&image, &mask, description) {
-        lap();
-        let closer = look(&seen, &mut lap)?;
-        mask = reference::zoom_mask(&closer, &mask, &description.camera, &gaze);
-        lap();
-    }
+    let masked = |image: &reference::Tensor, lap: &mut dyn FnMut()| {
+        run(&model.mask_network, image, lap).ok_or(LocateError::Shape("mask network"))
+    };
+    let mask = match model.coarse() {
+        None => masked(&image, &mut lap)?,
+        Some((network, zoom)) => {
+            let coarse = run(network, &image, &mut lap);
+            let coarse = coarse.ok_or(LocateError::Shape("coarse network"))?;
+            let camera = &description.camera;
+            let (seen, gaze) = reference::mask_input(&image, &coarse, camera, zoom);
+            lap();
+            let closer = masked(&seen, &mut lap)?;
+            let mask = reference::zoom_mask(&closer, &coarse, camera, &gaze);
+            lap();
+            mask
+        }
+    };
     let presence = description.presence;
     reference::coverage(&mask, presence.mask_threshold, presence.sure_threshold);
     lap();
     let (masked, gaze) = reference::joint_input(&image, &mask, description);
     lap();
-    let joints = reference::run_each(&model.joint_network, &masked, |_| lap())
-        .and_then(|mut outputs| outputs.pop())
-        .ok_or(LocateError::Shape("joint network"))?;
+    let joints = run(&model.joint_network, &masked, &mut lap);
+    let joints = joints.ok_or(LocateError::Shape("joint network"))?;
     let mut joints = joints.data().to_vec();
     if let Some(gaze) = gaze {
         joints = reference::zoom_joints(&joints, &gaze);
@@ -177,11 +184,13 @@ fn layer_works(model: &Model, batch: usize) -> Vec<LayerWork> {
     // Pixels have four bytes, as values have.
     let pixels = IMAGE.0 as usize * IMAGE.1 as usize;
     let mut layers = vec![between("rectify", pixels + image.len())];
+    if let Some(network) = &model.coarse_network {
+        layers.extend(network_works("coarse", network, batch));
+        layers.push(between("coarse.zoom_image", 2 * image.len() + mask.len()));
+    }
     layers.extend(network_works("mask", &model.mask_network, batch));
-    if model.description.second_look.is_some() {
-        layers.push(between("second.zoom_image", 2 * image.len() + mask.len()));
-        layers.extend(network_works("second", &model.mask_network, batch));
-        layers.push(between("second.zoom_mask", 3 * mask.len()));
+    if model.coarse_network.is_some() {
+        layers.push(between("zoom_mask", 3 * mask.len()));
     }
     layers.push(between("coverage", mask.len()));
     let zooms = model.description.zoom.is_some();

@@ -42,16 +42,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 
 fn card(model: &Model, file_size: usize) -> String {
     let description = &model.description;
-    let networks = [
-        ("mask network", &model.mask_network),
-        ("joint network", &model.joint_network),
-    ];
-    let looks = 1 + u64::from(description.second_look.is_some());
-    let macs = looks * model.mask_network.macs() + model.joint_network.macs();
-    let parameters: usize = networks
-        .iter()
-        .map(|(_, network)| network.parameter_count())
-        .sum();
+    let macs = model.networks().map(Network::macs).sum();
+    let parameters: usize = model.networks().map(Network::parameter_count).sum();
     let overlay = match description.overlay {
         Overlay::Multiply {} => "colour times mask".to_owned(),
         Overlay::Threshold { threshold } => {
@@ -61,7 +53,8 @@ fn card(model: &Model, file_size: usize) -> String {
             format!("colour that fades in from a mask of {low} to one of {high}")
         }
     };
-    let [second_look, zoom] = [description.second_look, description.zoom].map(|zoom| match zoom {
+    let coarse = model.coarse().map(|(_, zoom)| zoom);
+    let [coarse, zoom] = [coarse, description.zoom].map(|zoom| match zoom {
         None => "none".to_owned(),
         Some(zoom) => format!(
             "{} standard deviations of the mask across the image, {} to {} times",
@@ -88,9 +81,9 @@ fn card(model: &Model, file_size: usize) -> String {
          family      {}\n\
          joints      {}\n\
          input       {} x {} pixels, fx {} fy {} cx {} cy {}\n\
+         mask zoom   {coarse}\n\
          overlay     {overlay}\n\
-         second look {second_look}\n\
-         zoom        {zoom}\n\
+         joint zoom  {zoom}\n\
          arm         {arm}\n\
          mask        probability of at least {}\n\
          presence    probability of at least {} on {} % of the input\n\
@@ -110,7 +103,9 @@ fn card(model: &Model, file_size: usize) -> String {
         millions(macs),
         file_size / 1024,
     );
-    for (name, network) in networks {
+    let names = ["coarse network", "mask network", "joint network"];
+    let first = names.len() - model.networks().count();
+    for (name, network) in names.iter().skip(first).zip(model.networks()) {
         text += &layers(name, network);
     }
     if let Some(entries) = description.card.as_object().filter(|card| !card.is_empty()) {

@@ -3,6 +3,7 @@
 mod adapter;
 mod back_project;
 mod choice;
+mod coarse;
 mod concat;
 mod conv2d;
 mod coverage;
@@ -23,7 +24,6 @@ mod pipelines;
 mod plan;
 mod probe;
 mod rectify;
-mod second_look;
 mod sigmoid;
 mod soft_argmax2d;
 mod source;

@@ -1,10 +1,10 @@
 use image::RgbaImage;
 
+use super::coarse::{Coarse, Merged};
 use super::coverage::{Totals, coverage};
 use super::kinematic_fit::kinematic_fit;
 use super::overlay::overlay;
 use super::rectify::Rectify;
-use super::second_look::SecondLook;
 use super::source::Planes;
 use super::step::Step;
 use super::tensor::{Tensor, staging_buffer, storage_buffer};
@@ -13,15 +13,16 @@ use super::{Device, GpuError, NetworkPlan, Precision};
 use crate::camera::Rectification;
 use crate::network::{Coverage, Model};
 
-/// The whole cascade planned for a batch of images: rectify, mask network, overlay, joint network,
+/// The whole cascade planned for a batch of images: rectify, coarse network, mask network, overlay, joint network,
 /// coverage. Everything is allocated, compiled and bound once; a frame is one submission and one
 /// small readback.
 #[derive(Debug)]
 pub struct Plan {
     image: Tensor,
     rectify: Vec<Rectify>,
+    coarse: Option<Coarse>,
     mask: NetworkPlan,
-    second_look: Option<SecondLook>,
+    merged: Option<Merged>,
     coverage: Step,
     totals: wgpu::Buffer,
     /// How many frames ran to their end: a `u32`.
@@ -81,8 +82,7 @@ impl Plan {
         if batch == 0 {
             return Err(GpuError::Zero { what: "batch" });
         }
-        let networks = [&model.mask_network, &model.joint_network];
-        let layers = networks.iter().map(|network| network.nodes().len()).sum();
+        let layers = model.networks().map(|network| network.nodes().len()).sum();
         let mut done = 0;
         let mut planned = || {
             done += 1;
@@ -91,27 +91,31 @@ impl Plan {
         let description = &model.description;
         let layout = device.layout(precision)?;
         device.scoped(|| {
-            let image = NetworkPlan::input(device, layout, "image", &model.mask_network, batch)?;
-            let rectify = (0..batch).map(|_| Rectify::new(device)).collect();
-            let looked_at = match description.second_look {
-                None => image.clone(),
-                Some(_) => NetworkPlan::input(device, layout, "look", &model.mask_network, batch)?,
+            let input = |what, network| NetworkPlan::input(device, layout, what, network, batch);
+            let camera = description.camera;
+            let seen = input("image", &model.mask_network)?;
+            let (image, coarse) = match model.coarse() {
+                None => (seen.clone(), None),
+                Some((network, zoom)) => {
+                    let image = input("coarse image", network)?;
+                    let tensors = (&image, &seen);
+                    let coarse =
+                        Coarse::new(device, (network, zoom), tensors, camera, &mut planned)?;
+                    (image, Some(coarse))
+                }
             };
+            let rectify = (0..batch).map(|_| Rectify::new(device)).collect();
             let mask = NetworkPlan::planned(
                 device,
                 "mask",
                 &model.mask_network,
-                &looked_at,
+                &seen,
                 None,
                 &mut planned,
             )?;
-            let camera = description.camera;
-            let second_look = description
-                .second_look
-                .map(|zoom| SecondLook::new(device, &mask, (&image, &looked_at), camera, zoom));
-            let second_look = second_look.transpose()?;
-            let masked =
-                NetworkPlan::input(device, layout, "overlay", &model.joint_network, batch)?;
+            let merged = coarse.as_ref().map(|c| c.merge(device, mask.output()));
+            let merged = merged.transpose()?;
+            let masked = input("overlay", &model.joint_network)?;
             let joint = NetworkPlan::planned(
                 device,
                 "joint",
@@ -125,7 +129,7 @@ impl Plan {
                 "coverage: totals",
                 (batch * size_of::<Totals>()) as u64,
             )?;
-            let output = mask_of(&mask, second_look.as_ref());
+            let output = mask_of(&mask, merged.as_ref());
             let presence = description.presence;
             let thresholds = (presence.mask_threshold, presence.sure_threshold);
             let runs = storage_buffer(device, "coverage: runs", size_of::<u32>() as u64)?;
@@ -166,8 +170,9 @@ impl Plan {
                 overlay,
                 results,
                 masks,
+                coarse,
                 mask,
-                second_look,
+                merged,
                 joint,
                 behind,
             })
@@ -232,9 +237,9 @@ impl Plan {
         self.image.batch
     }
 
-    /// The mask network's answer, of both looks where it takes two: probabilities `[1, height, width]`.
+    /// The robot's mask: probabilities `[1, height, width]`.
     pub fn mask(&self) -> &Tensor {
-        mask_of(&self.mask, self.second_look.as_ref())
+        mask_of(&self.mask, self.merged.as_ref())
     }
 
     /// The joints in the canonical camera's frame: `[3 joints, 1, 1]`.
@@ -250,10 +255,9 @@ impl Plan {
 
     /// The dispatches from images to masks.
     fn mask_steps(&self) -> impl Iterator<Item = &Step> {
-        let look = self.second_look.as_ref();
-        let before = look.map(SecondLook::before);
-        let after = look.into_iter().flat_map(SecondLook::after);
-        before.into_iter().chain(self.mask.steps()).chain(after)
+        let coarse = self.coarse.iter().flat_map(Coarse::steps);
+        let merged = self.merged.iter().map(|merged| &merged.step);
+        coarse.chain(self.mask.steps()).chain(merged)
     }
 
     /// The dispatches from masks to joints.
@@ -491,8 +495,8 @@ impl Plan {
     }
 }
 
-fn mask_of<'a>(network: &'a NetworkPlan, second_look: Option<&'a SecondLook>) -> &'a Tensor {
-    second_look.map_or(network.output(), SecondLook::mask)
+fn mask_of<'a>(network: &'a NetworkPlan, merged: Option<&'a Merged>) -> &'a Tensor {
+    merged.map_or(network.output(), |merged| &merged.mask)
 }
 
 /// Where image `index` of a batch is rectified, and how.

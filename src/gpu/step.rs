@@ -206,11 +206,8 @@ impl Step {
     }
 
     /// The same, for the layer `label`.
-    pub(super) fn labelled(&self, label: &str) -> Self {
-        Self {
-            label: label.to_owned(),
-            ..self.clone()
-        }
+    pub(super) fn labelled(self, label: String) -> Self {
+        Self { label, ..self }
     }
 
     /// The layer that it belongs to, as `network.layer`. A layer's steps follow each other.

@@ -1,6 +1,6 @@
 use super::overlay::share_constants;
 use super::step::{Step, StepDescriptor, Tensors, Work};
-use super::tensor::{Tensor, constant_buffer, storage_buffer};
+use super::tensor::{Tensor, storage_buffer};
 use super::{Device, GpuError};
 use crate::camera::Intrinsics;
 use crate::network::{Overlay, Zoom};
@@ -22,22 +22,6 @@ impl Gazes {
     /// More images than a buffer holds.
     pub fn new(device: &Device, canonical: Intrinsics, batch: usize) -> Result<Self, GpuError> {
         let buffer = storage_buffer(device, "zoom: cameras", (batch * GAZE_SIZE) as u64)?;
-        Ok(Self { buffer, canonical })
-    }
-
-    /// The `canonical` camera itself for all of `batch` images, as long as no [`Gazes::zoom`] turns them. Driver errors
-    /// reach the caller's [`Device::scoped`].
-    ///
-    /// # Errors
-    /// More images than a buffer holds.
-    pub fn canonical(
-        device: &Device,
-        canonical: Intrinsics,
-        batch: usize,
-    ) -> Result<Self, GpuError> {
-        // Rows of the rotation; beside the first, the zoom.
-        let gaze = [1., 0., 0., 1., 0., 1., 0., 0., 0., 0., 1., 0.];
-        let buffer = constant_buffer(device, "zoom: canonical", &gaze.repeat(batch))?;
         Ok(Self { buffer, canonical })
     }
 
@@ -74,8 +58,8 @@ impl Gazes {
         )
     }
 
-    /// What they see of `image` (`shaders/zoom_image.wgsl`): four channels at most, to `output` of the same shape. To the
-    /// canonical camera, it stays as it is.
+    /// What they see of `image` (`shaders/zoom_image.wgsl`): four channels at most, to `output` of the same
+    /// shape.
     ///
     /// # Errors
     /// More pixels than a dispatch holds. Driver errors reach the caller's [`Device::scoped`].
@@ -95,7 +79,7 @@ impl Gazes {
     }
 
     /// The canonical camera's mask (`shaders/zoom_mask.wgsl`): `closer`, what they see of it, as far as they see, and
-    /// `first` beyond; all `[1, height, width]`.
+    /// `coarse` beyond; all `[1, height, width]`.
     ///
     /// # Errors
     /// More pixels than a dispatch holds. Driver errors reach the caller's [`Device::scoped`].
@@ -103,13 +87,13 @@ impl Gazes {
         &self,
         device: &Device,
         closer: &Tensor,
-        first: &Tensor,
+        coarse: &Tensor,
         output: &Tensor,
     ) -> Result<Step, GpuError> {
         self.step(
             device,
             ("zoom_mask", include_str!("../../shaders/zoom_mask.wgsl")),
-            Tensors::both_to(closer, first, output),
+            Tensors::both_to(closer, coarse, output),
             &[],
             output.texels().div_ceil(64),
         )

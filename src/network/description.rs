@@ -20,13 +20,13 @@ pub struct Description {
     pub input: InputSize,
     /// The pinhole camera that the networks were trained on, in pixels of `input`.
     pub camera: Intrinsics,
+    /// What turns the mask network's camera to the robot; without it, it is the canonical camera.
+    #[serde(default)]
+    pub coarse: Option<Coarse>,
     /// From colour `[3, height, width]` to the robot's mask `[1, height, width]` (paper, section III).
     pub mask_network: NetworkDescription,
     /// How mask and colour make the joint network's input.
     pub overlay: Overlay,
-    /// Where the mask network looks again, at what its first mask shows; without it, it looks once.
-    #[serde(default)]
-    pub second_look: Option<Zoom>,
     /// Where the joint network's camera looks; without it, it is the canonical camera.
     #[serde(default)]
     pub zoom: Option<Zoom>,
@@ -59,6 +59,16 @@ pub struct InputSize {
 pub struct NetworkDescription {
     /// In the order in which they run; the last one is the output.
     pub layers: Vec<Layer>,
+}
+
+/// A mask from little arithmetic, and the camera that is turned by it.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Coarse {
+    /// From colour `[3, height, width]` to a coarse mask `[1, height, width]`.
+    pub network: NetworkDescription,
+    /// Where the mask network's camera looks, each pixel of the coarse mask as heavy as it is probable.
+    pub zoom: Zoom,
 }
 
 /// How mask and colour make the joint network's input.
@@ -208,7 +218,8 @@ impl Description {
                 }
             }
         }
-        for (key, zoom) in [("second_look", self.second_look), ("zoom", self.zoom)] {
+        let coarse = self.coarse.as_ref().map(|coarse| coarse.zoom);
+        for (key, zoom) in [("coarse.zoom", coarse), ("zoom", self.zoom)] {
             let Some(Zoom {
                 spread,
                 least,

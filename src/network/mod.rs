@@ -10,7 +10,9 @@ mod shape;
 
 pub use arm::{Arm, Links};
 pub use coverage::Coverage;
-pub use description::{Description, InputSize, NetworkDescription, Overlay, Presence, Zoom};
+pub use description::{
+    Coarse, Description, InputSize, NetworkDescription, Overlay, Presence, Zoom,
+};
 pub use graph::{Network, Node, Parameters, Source};
 pub use layer::{Activation, Layer, Operation};
 pub use model::{Model, ModelError};

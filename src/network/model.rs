@@ -5,13 +5,16 @@ use half::f16;
 use safetensors::{Dtype, SafeTensors};
 
 use super::description::{Description, NetworkDescription};
-use super::{Layer, Network, NetworkError, Parameters, Shape};
+use super::{Layer, Network, NetworkError, Parameters, Shape, Zoom};
 
-/// A trained model: the two networks of the cascade and their description.
+/// A trained model: the networks of the cascade and their description.
 #[derive(Debug, Clone)]
 pub struct Model {
     /// Everything that is not a tensor.
     pub description: Description,
+    /// Colour `[3, height, width]` in [0, 1] to a coarse mask `[1, height, width]` in [0, 1], by which the mask network's camera
+    /// is turned; `None` where that is the canonical camera.
+    pub coarse_network: Option<Network>,
     /// Colour `[3, height, width]` in [0, 1] to mask `[1, height, width]` in [0, 1].
     pub mask_network: Network,
     /// Overlay `[3, height, width]` to `[3 * joints, 1, 1]`, metres.
@@ -127,6 +130,10 @@ impl Model {
             })
             .map_err(|e| network(NetworkDescription::named(name, e)))
         };
+        let coarse = description.coarse.as_ref();
+        let coarse_network = coarse
+            .map(|coarse| build("coarse", "image", &coarse.network.layers))
+            .transpose()?;
         let mask_network = build("mask", "image", &description.mask_network.layers)?;
         let joint_network = build("joint", "overlay", &description.joint_network.layers)?;
 
@@ -147,15 +154,31 @@ impl Model {
             }
         };
         let mask_shape = Shape::new(1, image.height, image.width);
+        if let Some(network) = &coarse_network {
+            same_shape("coarse.network", mask_shape, network.output())?;
+        }
         same_shape("mask_network", mask_shape, mask_network.output())?;
         let joint_shape = Shape::new(3 * description.joints.len(), 1, 1);
         same_shape("joint_network", joint_shape, joint_network.output())?;
 
         Ok(Self {
             description,
+            coarse_network,
             mask_network,
             joint_network,
         })
+    }
+
+    /// The networks, in the order in which they run.
+    pub fn networks(&self) -> impl Iterator<Item = &Network> {
+        let networks = [&self.mask_network, &self.joint_network];
+        self.coarse_network.iter().chain(networks)
+    }
+
+    /// The coarse network and what its mask turns, where there is one.
+    pub(crate) fn coarse(&self) -> Option<(&Network, Zoom)> {
+        let coarse = self.description.coarse.as_ref()?;
+        Some((self.coarse_network.as_ref()?, coarse.zoom))
     }
 }
 

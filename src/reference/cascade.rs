@@ -2,35 +2,30 @@ use super::{
     Gaze, Tensor, kinematic_fit, overlay, run, zoom, zoom_image, zoom_joints, zoom_mask,
     zoom_overlay,
 };
-use crate::network::{Description, Model, Overlay};
+use crate::camera::Intrinsics;
+use crate::network::{Description, Model, Overlay, Zoom};
 
-/// The mask of the robot in `image`: the mask network's, of the second look too where `model` takes one. `None` where the
-/// image is not what the network takes.
+/// The mask of the robot in `image`: the mask network's and, where `model` has a coarse network, that one's beyond what its camera
+/// sees. `None` where the image is not what the networks take.
 pub fn mask(model: &Model, image: &Tensor) -> Option<Tensor> {
-    let (network, description) = (&model.mask_network, &model.description);
-    let first = run(network, image)?;
-    let Some((closer, gaze)) = second_look(image, &first, description) else {
-        return Some(first);
+    let Some((network, rules)) = model.coarse() else {
+        return run(&model.mask_network, image);
     };
-    let closer = run(network, &closer)?;
-    Some(zoom_mask(&closer, &first, &description.camera, &gaze))
+    let (coarse, camera) = (run(network, image)?, &model.description.camera);
+    let (seen, gaze) = mask_input(image, &coarse, camera, rules);
+    let closer = run(&model.mask_network, &seen)?;
+    Some(zoom_mask(&closer, &coarse, camera, &gaze))
 }
 
-/// The mask network's input when it looks again, at what its `first` mask of `image` shows, and where it looks from. `None` where
-/// `description` asks for one look.
-pub fn second_look(
+/// The mask network's input behind a coarse network, and where it looks from: what it sees of `image` by the `coarse` mask.
+pub fn mask_input(
     image: &Tensor,
-    first: &Tensor,
-    description: &Description,
-) -> Option<(Tensor, Gaze)> {
-    let camera = &description.camera;
-    let gaze = zoom(
-        first,
-        Overlay::Multiply {},
-        camera,
-        description.second_look?,
-    );
-    Some((zoom_image(image, camera, &gaze), gaze))
+    coarse: &Tensor,
+    camera: &Intrinsics,
+    rules: Zoom,
+) -> (Tensor, Gaze) {
+    let gaze = zoom(coarse, Overlay::Multiply {}, camera, rules);
+    (zoom_image(image, camera, &gaze), gaze)
 }
 
 /// The joint network's input, and where it looks from unless that is the canonical camera: the overlay of `image` and

@@ -21,7 +21,7 @@ mod upsample2d;
 mod zoom;
 
 pub use back_project::back_project;
-pub use cascade::{joint_input, joints, mask, second_look};
+pub use cascade::{joint_input, joints, mask, mask_input};
 pub use concat::concat;
 pub use conv2d::conv2d;
 pub use coverage::coverage;

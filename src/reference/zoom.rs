@@ -88,20 +88,16 @@ pub fn zoom_overlay(
     overlay(&seen, &covered, rule)
 }
 
-/// `image` of the canonical `camera` as `gaze` sees it: sampled bilinearly, black beyond its borders. Through the canonical
-/// camera itself it stays as it is.
+/// `image` of the canonical `camera` as `gaze` sees it: sampled bilinearly, black beyond its borders.
 pub fn zoom_image(image: &Tensor, camera: &Intrinsics, gaze: &Gaze) -> Tensor {
-    if *gaze == Gaze::CANONICAL {
-        return image.clone();
-    }
     sampled(image, camera, gaze)
 }
 
-/// The canonical `camera`'s mask: `closer`, what `gaze` sees of it, sampled bilinearly as far as it sees, `first` beyond, and
+/// The canonical `camera`'s mask: `closer`, what `gaze` sees of it, sampled bilinearly as far as it sees, `coarse` beyond, and
 /// both over the pixel between; all `[1, height, width]`.
-pub fn zoom_mask(closer: &Tensor, first: &Tensor, camera: &Intrinsics, gaze: &Gaze) -> Tensor {
-    let Shape { height, width, .. } = first.shape();
-    let mut mask = first.clone();
+pub fn zoom_mask(closer: &Tensor, coarse: &Tensor, camera: &Intrinsics, gaze: &Gaze) -> Tensor {
+    let Shape { height, width, .. } = coarse.shape();
+    let mut mask = coarse.clone();
     let (pinhole, zoomed) = (Pinhole::of(camera, 1.0), Pinhole::of(camera, gaze.zoom));
     for y in 0..height {
         for x in 0..width {
@@ -110,7 +106,7 @@ pub fn zoom_mask(closer: &Tensor, first: &Tensor, camera: &Intrinsics, gaze: &Ga
             };
             let to = y * width + x;
             let beyond = 1.0 - inside(closer.shape(), at);
-            mask.data[to] = sample(closer, 0, at) + beyond * first.data[to];
+            mask.data[to] = sample(closer, 0, at) + beyond * coarse.data[to];
         }
     }
     mask

@@ -277,14 +277,31 @@ pub fn description(width: u32, height: u32, filters: usize) -> serde_json::Value
     })
 }
 
+/// What turns the mask network's camera, as `zoom` says.
+pub fn coarse(zoom: serde_json::Value) -> serde_json::Value {
+    serde_json::json!({"zoom": zoom, "network": {"layers": [
+        {"name": "conv1", "op": "conv2d", "inputs": ["image"], "out_channels": 8, "kernel": 3, "dilation": 2,
+            "activation": "relu"},
+        {"name": "pool1", "op": "max_pool2d", "inputs": ["conv1"], "size": 4},
+        {"name": "conv2", "op": "conv2d", "inputs": ["pool1"], "out_channels": 1, "kernel": 3, "dilation": 1,
+            "activation": "none"},
+        {"name": "up1", "op": "upsample2d", "inputs": ["conv2"], "scale": 4},
+        {"name": "mask", "op": "sigmoid", "inputs": ["up1"]}]}})
+}
+
 /// Dimensions of each tensor that the networks of `description` need.
 pub fn tensor_dims(description: &serde_json::Value) -> Vec<(String, Vec<usize>)> {
     let side = |name: &str| description["input"][name].as_u64().unwrap() as usize;
     let image = Shape::new(3, side("height"), side("width"));
     let mut dims = Vec::new();
-    for (network, input) in [("mask", "image"), ("joint", "overlay")] {
-        let layers = description[format!("{network}_network")]["layers"].clone();
-        let layers: Vec<Layer> = serde_json::from_value(layers).unwrap();
+    for (network, input, described) in [
+        ("coarse", "image", &description["coarse"]["network"]),
+        ("mask", "image", &description["mask_network"]),
+        ("joint", "overlay", &description["joint_network"]),
+    ] {
+        let Ok(layers) = serde_json::from_value::<Vec<Layer>>(described["layers"].clone()) else {
+            continue;
+        };
         Network::new(input, image, layers, |layer, weight, bias| {
             dims.push((format!("{network}.{layer}.weight"), weight.to_vec()));
             dims.push((format!("{network}.{layer}.bias"), bias.to_vec()));

@@ -45,8 +45,18 @@ def draw_recording(folder, count, seed=0):
     assert all(math.isfinite(json.loads(line)["coverage"]) for line in lines)
 
 
+def _drawn(tmp_path_factory, count):
+    folder = tmp_path_factory.mktemp("recordings") / "drawn"
+    draw_recording(folder, count)
+    return folder
+
+
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("recordings") / "drawn"
-    draw_recording(folder, 40)
-    return folder
+    return _drawn(tmp_path_factory, 40)
+
+
+@pytest.fixture(scope="session")
+def small_recording(tmp_path_factory):
+    """For tests of which each picture costs a network's time often."""
+    return _drawn(tmp_path_factory, 12)

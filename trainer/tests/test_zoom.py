@@ -79,13 +79,13 @@ def test_varied_cameras_still_look_there():
     assert 1.6 < zooms.min() < 1.9 < 2.1 < zooms.max() < 2.4
 
 
-def test_a_second_look_is_merged_where_it_sees_and_the_first_stays_elsewhere():
+def test_a_closer_mask_is_merged_where_its_camera_sees_and_the_coarse_one_stays_elsewhere():
     rotations = zoom.turns(*torch.deg2rad(torch.tensor([[14.0, -5.0], [-9.0, 4.0], [0.0, 7.0]])))
     zooms = torch.tensor([2.0, 1.4])
     v, u = torch.meshgrid(torch.arange(INPUT_HEIGHT), torch.arange(INPUT_WIDTH), indexing="ij")
     # Linear in the pixel: a bilinear sample of it is exact.
-    second, first = ((2 * u + v) / 1000).expand(2, 1, -1, -1), torch.full((2, 1, INPUT_HEIGHT, INPUT_WIDTH), 0.25)
-    merged = zoom.merge(first, second, rotations, zooms)
+    closer, coarse = ((2 * u + v) / 1000).expand(2, 1, -1, -1), torch.full((2, 1, INPUT_HEIGHT, INPUT_WIDTH), 0.25)
+    merged = zoom.merge(coarse, closer, rotations, zooms)
     inside, border = 0, 0
     for number in range(2):
         for y in range(0, INPUT_HEIGHT, 3):
@@ -104,22 +104,22 @@ def test_a_second_look_is_merged_where_it_sees_and_the_first_stays_elsewhere():
                 else:
                     border += 1
     count = len(range(0, INPUT_HEIGHT, 3)) * len(range(0, INPUT_WIDTH, 3))
-    # Neither look is all of it, and few pixels are left unlooked at.
+    # Neither is all of it, and few pixels are left unlooked at.
     assert 0.3 * 2 * count < inside < 0.8 * 2 * count and border < 0.05 * count
-    # The first look is what shows through, and no other turn will do.
-    assert (zoom.merge(first + 0.5, second, rotations, zooms) != merged).any()
-    assert (zoom.merge(first, second, rotations.mT, zooms) - merged).abs().max() > 0.1
+    # The coarse mask is what shows through, and no other turn will do.
+    assert (zoom.merge(coarse + 0.5, closer, rotations, zooms) != merged).any()
+    assert (zoom.merge(coarse, closer, rotations.mT, zooms) - merged).abs().max() > 0.1
 
 
-def test_at_the_border_of_a_second_look_the_mask_does_not_jump():
+def test_at_the_border_of_a_closer_mask_the_mask_does_not_jump():
     nothing, all_of_it = torch.zeros(1, 1, INPUT_HEIGHT, INPUT_WIDTH), torch.ones(1, 1, INPUT_HEIGHT, INPUT_WIDTH)
     pans = torch.deg2rad(torch.linspace(8, 9, 300))
     zeros = torch.zeros(1)
     masks = torch.cat([
         zoom.merge(nothing, all_of_it, zoom.turns(pan[None], zeros, zeros), torch.full((1,), 1.5)) for pan in pans])
-    # The border passes some columns of pixels, by about two hundredths of a pixel of the second look a step.
+    # The border passes some columns of pixels, by about two hundredths of its pixels a step.
     assert (masks[0] != masks[-1]).any() and masks.diff(dim=0).abs().max() < 0.05
-    # A border that belonged to either look would jump.
+    # A border that belonged to either mask would jump.
     assert (masks > 0.999).float().diff(dim=0).abs().max() == 1
 
 
@@ -130,12 +130,12 @@ class _Bright(torch.nn.Module):
         return images[:, :1].sigmoid() * 0.8
 
 
-def test_of_what_is_alike_everywhere_the_second_look_is_the_first():
+def test_of_what_is_alike_everywhere_the_closer_mask_is_the_same():
     torch.manual_seed(0)
     images = torch.rand(2, 3, INPUT_HEIGHT, INPUT_WIDTH)
     images[0] = 0.5
     images[1, :, 60:100, 30:90] += 5
-    once, twice = (evaluate.masks_of(_Bright(), images, second_look) for second_look in (None, zoom.SECOND_LOOK))
+    once, twice = (evaluate.masks_of(_Bright(), images, coarse) for coarse in (None, _Bright()))
     assert torch.allclose(once[0], twice[0], atol=1e-4)
     # Where there is something, it is looked at.
     assert not torch.allclose(once[1], twice[1], atol=0.1)

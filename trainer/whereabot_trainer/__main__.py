@@ -97,6 +97,8 @@ def main(argv=None):
                     dilations=(1, 3, 9, 27, 1))
     command.add_argument("--family", choices=("paper", "context"), default="paper",
                          help="the paper's network, or a wider one with skips that has no --dilations and no --kernel (%(default)s)")
+    command.add_argument("--coarse", action="store_true",
+                         help="train the context family's coarse network, which tells its mask network where to look")
     command.add_argument("--kernel", type=int, default=3, metavar="K",
                          help="columns and rows of the paper's network's convolutions (%(default)s)")
     command.add_argument("--crop", nargs=2, type=int, default=(160, 128), metavar=("W", "H"),
@@ -121,6 +123,8 @@ def main(argv=None):
                          " and 0.6 (paper: threshold, context: ramp)")
     command.add_argument("--mask-run", metavar="RUN", help="finished run of train-mask, or a model file, whose masks"
                          " the full system is validated with")
+    command.add_argument("--coarse-run", metavar="RUN", help="finished run of train-mask --coarse, or a model file, by whose masks"
+                         " --mask-run's network looks (without: as its model file has it)")
     command.add_argument("--estimated-masks", type=float, default=0.0, metavar="SHARE",
                          help="share of training samples with the mask run's masks for the true ones (%(default)s)")
     command.add_argument("--estimated-after", type=float, default=0.0, metavar="PROGRESS",
@@ -129,9 +133,11 @@ def main(argv=None):
                          help="leave out samples with less of the robot in view (%(default)s)")
     command.set_defaults(run=_run(train.train_joint))
 
-    command = commands.add_parser("export", help="write both networks as a model file")
+    command = commands.add_parser("export", help="write the networks as a model file")
     command.add_argument("--mask", required=True, nargs="+", metavar="RUN", help="run of train-mask, or a model file whose mask"
                          " network stays; of several runs that started from each other, the mean of their weights")
+    command.add_argument("--coarse", metavar="RUN", help="run of train-mask --coarse, or a model file, by whose masks the mask network"
+                         " looks (without: as its model file has it)")
     command.add_argument("--joint", required=True, nargs="+", metavar="RUN", help="run of train-joint, or a model file likewise; of several runs,"
                          " likewise")
     source = command.add_mutually_exclusive_group(required=True)

@@ -15,48 +15,46 @@ def _batches(numbers):
     return (numbers[start : start + BATCH] for start in range(0, len(numbers), BATCH))
 
 
-def _last_bias(network):
-    return getattr(network, network.layers[-1]["name"]).bias
-
-
 def shift_logits(network, shift):
-    """Adds `shift` to the logit of a mask network, in place: exact, because the bias is inside the sigmoid."""
+    """Adds `shift` to the logit of a mask network, in place: exact, because the last convolution's bias is inside the sigmoid."""
+    last = next(layer["name"] for layer in reversed(network.layers) if layer["op"] == "conv2d")
     with torch.no_grad():
-        _last_bias(network).add_(shift)
+        getattr(network, last).bias.add_(shift)
 
 
 @torch.no_grad()
-def masks_of(network, images, second_look=None, bf16=False):
-    """The masks [N, 1, H, W] of `images`; of two second_look where there is a `second_look`."""
-    def look(images):
+def masks_of(network, images, coarse=None, bf16=False):
+    """The masks [N, 1, H, W] of `images`: the mask network's, which looks where the `coarse` network's mask turns it to if there is
+    one."""
+    def run(network, images):
         with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
             return network(images.contiguous(memory_format=torch.channels_last)).float()
 
-    first = look(images)
-    if second_look is None:
-        return first
-    cameras = zoom.look_at(first, second_look, zoom.LOOKED_AT)
-    return zoom.merge(first, look(zoom.see(images, *cameras)), *cameras)
+    if coarse is None:
+        return run(network, images)
+    mask = run(coarse, images)
+    cameras = zoom.look_at(mask, zoom.MASK_ZOOM, zoom.LOOKED_AT)
+    return zoom.merge(mask, run(network, zoom.see(images, *cameras)), *cameras)
 
 
-def estimate_masks(network, samples, numbers, device, second_look=None):
-    """The mask network's answer for each sample as {number: uint8 [H, W]}, 255 for certain; `second_look` as of `masks_of`."""
+def estimate_masks(network, samples, numbers, device, coarse=None):
+    """The mask network's answer for each sample as {number: uint8 [H, W]}, 255 for certain; `coarse` as of `masks_of`."""
     answers = {}
     for batch in _batches(numbers):
-        estimate = masks_of(network, samples.pixels(batch)[0].to(device), second_look)
+        estimate = masks_of(network, samples.pixels(batch)[0].to(device), coarse)
         for number, mask in zip(batch, estimate, strict=True):
             answers[int(number)] = (mask[0] * 255).round().byte().cpu().numpy()
     return answers
 
 
-def mask_histograms(network, samples, numbers, device, second_look=None):
+def mask_histograms(network, samples, numbers, device, coarse=None):
     """Pixels by logit: (robot, background), each [N, bins], for each of the samples."""
     bins = len(LOGIT_EDGES) - 1
     edges = torch.from_numpy(LOGIT_EDGES[1:-1]).to(device)
     histograms = []
     for batch in _batches(numbers):
         images, masks = samples.pixels(batch)
-        logits = torch.logit(masks_of(network, images.to(device), second_look).double(), eps=1e-6)
+        logits = torch.logit(masks_of(network, images.to(device), coarse).double(), eps=1e-6)
         # A value on an edge is of the bin above.
         counted = torch.bucketize(logits, edges, right=True) + bins * (masks.to(device) < 0.5)
         histograms += [torch.bincount(each.flatten(), minlength=2 * bins).cpu().numpy() for each in counted]
@@ -81,15 +79,15 @@ def figures_by_threshold(robot, background):
     }
 
 
-def calibrate(network, samples, numbers, device, second_look=None):
+def calibrate(network, samples, numbers, device, coarse=None):
     """The shift of the logit that gives the best IoU at the threshold 0.5."""
-    curves = figures_by_threshold(*mask_histograms(network, samples, numbers, device, second_look))
+    curves = figures_by_threshold(*mask_histograms(network, samples, numbers, device, coarse))
     return round(float(-LOGIT_EDGES[int(curves["iou"].argmax())]), 3)
 
 
-def score_mask(network, samples, numbers, device, shift=0.0, second_look=None):
+def score_mask(network, samples, numbers, device, shift=0.0, coarse=None):
     """Figures at the threshold 0.5, the logits being shifted."""
-    curves = figures_by_threshold(*mask_histograms(network, samples, numbers, device, second_look))
+    curves = figures_by_threshold(*mask_histograms(network, samples, numbers, device, coarse))
     half = int(np.argmin(np.abs(LOGIT_EDGES[:-1] + shift)))
     return {name: round(float(curve[half]), 4) for name, curve in curves.items()}
 

@@ -67,11 +67,12 @@ def _mean_of(runs):
 def export_runs(args):
     """Folds calibration and standardisation into the weights, measures the cascade, and writes the model file."""
     mask_file, joint_file = _model_file(args.mask), _model_file(args.joint)
-    mask, _, mask_mean = _mean_of(args.mask) if not mask_file else (read_model(mask_file)[0], None, {})
-    joint, joint_state, joint_mean = _mean_of(args.joint) if not joint_file else (read_model(joint_file)[1], None, {})
+    kept, kept_description = read_model(mask_file) if mask_file else ({}, {})
+    mask, _, mask_mean = _mean_of(args.mask) if not mask_file else (kept["mask"], None, {})
+    joint, joint_state, joint_mean = _mean_of(args.joint) if not joint_file else (read_model(joint_file)[0]["joint"], None, {})
+    coarse, coarse_card = _coarse(args.coarse) if args.coarse else (kept.get("coarse"), _coarse_card(kept_description))
     mask_card, joint_card = _mask_card(args.mask[-1]), _joint_card(args.joint[-1])
     family, rules = mask_card["mask_training"]["family"], (joint_card["overlay"], joint_card["zoom"])
-    second_look = zoom.second_look_of(family)
 
     samples = data.Samples(args.validation or args.recording, args.cache, joint_card["arm_lengths"])
     robots = sorted(set(samples.robots))
@@ -100,25 +101,19 @@ def export_runs(args):
     order = np.union1d(chosen, reported)
 
     if not mask_file:
-        shift = evaluate.calibrate(mask, samples, chosen[own[chosen]], args.device)
+        shift = evaluate.calibrate(mask, samples, chosen[own[chosen]], args.device, coarse)
         evaluate.shift_logits(mask, shift)
-        if second_look:
-            # Only a calibrated first look tells where the second one is to be.
-            more = evaluate.calibrate(mask, samples, chosen[own[chosen]], args.device, second_look)
-            evaluate.shift_logits(mask, more)
-            shift = round(shift + more, 3)
         mask_card["calibration"]["logit_shift"] = shift
-    estimated = evaluate.estimate_masks(mask, samples, order, args.device, second_look)
+    estimated = evaluate.estimate_masks(mask, samples, order, args.device, coarse)
     seen = samples.has_robot & (samples.coverage >= joint_card["min_coverage"])
     empty = samples.coverage == 0
 
     def shares(numbers, threshold):
         return [float((estimated[n] >= 255 * threshold).mean()) for n in numbers]
 
-    kept = read_model(mask_file)[2] if mask_file else None
-    if kept and kept.get("second_look") == second_look:
-        # It is the mask network's, which stays.
-        sure, least = kept["presence"]["sure_threshold"], kept["presence"]["min_sure"]
+    if kept and not args.coarse:
+        # It is the masks', which stay.
+        sure, least = (kept_description["presence"][key] for key in ("sure_threshold", "min_sure"))
     else:
         sure, least = choose_presence(*(
             {threshold: shares(chosen[kind[chosen]], threshold) for threshold in SURE_THRESHOLDS}
@@ -140,7 +135,7 @@ def export_runs(args):
             unfitted = "joints are not those of an arm of Universal Robots' kind"
 
     shown = reported[seen[reported]]
-    measured = evaluate.score_mask(mask, samples, reported, args.device, second_look=second_look)
+    measured = evaluate.score_mask(mask, samples, reported, args.device, coarse=coarse)
     figures = {name: measured[name] for name in ("accuracy", "iou", "precision", "recall")}
     for name, masks in (("true_mask", None), ("estimated_mask", estimated)):
         figures |= evaluate.score_joints(
@@ -160,17 +155,18 @@ def export_runs(args):
         "task": "mask and joints (metres, camera optical frame) of one robot arm in one colour image",
         "data": {"training": joint_card["training"], "validation": samples.sources, "protocol": joint_card["protocol"],
                  "note": args.note},
-        "arm_length_m": arm, "fit": fitted_arm is not None,
+        "arm_length_m": arm, "fit": fitted_arm is not None, **coarse_card,
         "mask_training": mask_card["mask_training"] | mask_mean, "joint_training": joint_card["joint_training"] | joint_mean,
         "calibration": mask_card["calibration"], "figures": figures,
         "curves": {"mask_accuracy": mask_card["curves"]["mask_accuracy"], **joint_card["curves"]},
         "trainer": f"whereabot-trainer {__version__}, torch {torch.__version__.split('+')[0]}",
         "licence": args.licence,
     }
+    networks = {**({"coarse": coarse} if coarse else {}), "mask": mask, "joint": joint}
     description = describe(
-        mask.layers, joint.layers, family=family, robot=robot, overlay=rules[0], zoom=rules[1], second_look=second_look,
-        arm=fitted_arm, presence={"mask_threshold": 0.5, "sure_threshold": sure, "min_sure": least}, card=card)
-    write_model(args.out, mask, joint, description, args.dtype)
+        {name: network.layers for name, network in networks.items()}, family=family, robot=robot, overlay=rules[0],
+        mask_zoom=zoom.MASK_ZOOM, zoom=rules[1], arm=fitted_arm, presence={"mask_threshold": 0.5, "sure_threshold": sure, "min_sure": least}, card=card)
+    write_model(args.out, networks, description, args.dtype)
     print(json.dumps({"chosen": description["presence"], "figures": figures}, indent=1))
     if unfitted:
         print(f"no kinematic fit: {unfitted}")
@@ -186,10 +182,29 @@ MASK_CURVES = {"accuracy": "mask_accuracy"}
 JOINT_CURVES = {"true_mask_mean_cm": "true_mask_cm", "estimated_mask_mean_cm": "estimated_mask_cm"}
 
 
+def _coarse(path):
+    """(the coarse network, calibrated, what the card says of it) of a run's folder or, as it stands there, of a model file."""
+    file = _model_file([path])
+    if file:
+        networks, description = read_model(file)
+        if "coarse" not in networks:
+            raise SystemExit(f"--coarse: {file} has no coarse network")
+        return networks["coarse"], _coarse_card(description)
+    network, state = load_network(path)
+    shift = state["figures"]["logit_shift"]
+    evaluate.shift_logits(network, shift)
+    return network, {"coarse_training": _training(state) | {"logit_shift": shift}}
+
+
+def _coarse_card(description):
+    """What a model file's card says of its coarse network."""
+    return {key: value for key, value in description.get("card", {}).items() if key == "coarse_training"}
+
+
 def _mask_card(path):
     """What the card says of the mask network of a run's folder or, as it stands there, of a model file."""
     if not Path(path).is_dir():
-        return read_model(path)[2]["card"]
+        return read_model(path)[1]["card"]
     state = load_network(path)[1]
     return {
         "mask_training": _training(state), "curves": _curves(path, MASK_CURVES),
@@ -201,7 +216,7 @@ def _mask_card(path):
 def _joint_card(path):
     """What there is to know of the joint network of a run's folder or, as it stands there, of a model file."""
     if not Path(path).is_dir():
-        description = read_model(path)[2]
+        description = read_model(path)[1]
         card = description["card"]
         return {
             "overlay": description["overlay"], "zoom": description.get("zoom"),

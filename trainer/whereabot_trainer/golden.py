@@ -2,8 +2,8 @@
 
 `NAME.safetensors` is a complete model file. `NAME.activations.safetensors` holds, in f32 and without a batch
 dimension, the input `mask.image`, every layer's output as `mask.{layer}` and `joint.{layer}`, the joint network's
-input `joint.overlay`, and the cascade's result `joints` [18], in the canonical camera's frame. Where the mask network looks
-a second time, that look's input is `second.image`, its layers `second.{layer}`, and the mask of both looks `merged`.
+input `joint.overlay`, and the cascade's result `joints` [18], in the canonical camera's frame. Where a coarse network turns the
+mask network's camera, the input is `coarse.image`, its layers `coarse.{layer}`, and the mask of both networks `merged`.
 """
 
 from pathlib import Path
@@ -29,6 +29,17 @@ MASK_LAYERS = [
     {"name": "conv4", "op": "conv2d", "inputs": ["conv3"], "out_channels": 1, "kernel": 1, "dilation": 1,
      "activation": "none"},
     {"name": "mask", "op": "sigmoid", "inputs": ["conv4"]},
+]
+COARSE_LAYERS = [
+    {"name": "conv1", "op": "conv2d", "inputs": ["image"], "out_channels": 5, "kernel": 3, "dilation": 1,
+     "activation": "relu"},
+    {"name": "pool1", "op": "max_pool2d", "inputs": ["conv1"], "size": 2},
+    {"name": "conv2", "op": "conv2d", "inputs": ["pool1"], "out_channels": 7, "kernel": 3, "dilation": 3,
+     "activation": "relu"},
+    {"name": "conv3", "op": "conv2d", "inputs": ["conv2"], "out_channels": 1, "kernel": 1, "dilation": 1,
+     "activation": "none"},
+    {"name": "up1", "op": "upsample2d", "inputs": ["conv3"], "scale": 2},
+    {"name": "mask", "op": "sigmoid", "inputs": ["up1"]},
 ]
 # 14 x 20 pools by 2 to 7 x 10, and by 3 to 2 x 3: a row and a column are left over.
 JOINT_LAYERS = [
@@ -121,21 +132,27 @@ def _networks(seed, image, mask_layers, joint_layers):
 
 
 @torch.no_grad()
-def cascade_activations(mask, joint, description, image):
+def cascade_activations(networks, description, image):
     """Every value of the cascade on one image [3, H, W], by `{network}.{layer}`."""
-    values = {f"mask.{name}": value[0] for name, value in mask.activations(image[None]).items()}
-    estimate = values["mask.mask"][None]
-    if "second_look" in description:
-        cameras = zoom.look_at(estimate, description["second_look"], zoom.LOOKED_AT, description["camera"])
-        second = mask.activations(zoom.see(image[None], *cameras, description["camera"]))
-        values |= {f"second.{name}": value[0] for name, value in second.items()}
-        estimate = zoom.merge(estimate, second["mask"], *cameras, description["camera"])
+    def activations(name, image):
+        return {f"{name}.{layer}": value[0] for layer, value in networks[name].activations(image).items()}
+
+    values, camera = {}, description["camera"]
+    if "coarse" in networks:
+        values |= activations("coarse", image[None])
+        coarse = values["coarse.mask"][None]
+        cameras = zoom.look_at(coarse, description["coarse"]["zoom"], zoom.LOOKED_AT, camera)
+        values |= activations("mask", zoom.see(image[None], *cameras, camera))
+        estimate = zoom.merge(coarse, values["mask.mask"][None], *cameras, camera)
         values["merged"] = estimate[0]
-    seen, cameras = overlays(image[None], estimate, description["overlay"], description.get("zoom"), description["camera"])
-    values |= {f"joint.{name}": value[0] for name, value in joint.activations(seen).items()}
+    else:
+        values |= activations("mask", image[None])
+        estimate = values["mask.mask"][None]
+    seen, cameras = overlays(image[None], estimate, description["overlay"], description.get("zoom"), camera)
+    values |= activations("joint", seen)
     # A vector, not an image of one pixel.
     values = {name: value.flatten() if value.shape[1:] == (1, 1) else value for name, value in values.items()}
-    joints = values[f"joint.{joint.layers[-1]['name']}"].clone()
+    joints = values[f"joint.{networks['joint'].layers[-1]['name']}"].clone()
     if cameras is not None:
         joints = zoom.joints_of(joints.reshape(1, -1, 3), *cameras).flatten()
     if "arm" in description:
@@ -145,7 +162,7 @@ def cascade_activations(mask, joint, description, image):
 
 
 def write_golden(folder, seed=1):
-    """Writes the models `tiny`, `threshold`, `tiny_f16`, `context`, `heatmap`, `zoom`, `arm` and `second_look` with their
+    """Writes the models `tiny`, `threshold`, `tiny_f16`, `context`, `heatmap`, `zoom`, `arm` and `coarse` with their
     activations."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -158,32 +175,40 @@ def write_golden(folder, seed=1):
     heatmap = (MASK_LAYERS, HEATMAP_LAYERS, WIDTH, HEIGHT)
     # The mask is spread over the whole small image: this looks at the middle half of it.
     view = {"spread": 2.0, "least": 0.5, "most": 4.0}
-    # Half of the image is beyond the second look; the joint network's is beside the middle.
+    # Half of the image is beyond the mask network's view; the joint network's is beside the middle.
     closer, beside = {"spread": 2.0, "least": 1.0, "most": 4.0}, {"rule": "ramp", "low": 0.5, "high": 0.9}
-    for name, family, (mask_layers, joint_layers, width, height), rule, second_look, view, arm, dtype in (
+    for name, family, (mask_layers, joint_layers, width, height), rule, mask_zoom, view, arm, dtype in (
         ("tiny", "paper", paper, multiply, None, None, None, "f32"),
         ("threshold", "paper", paper, threshold, None, None, None, "f32"),
         ("tiny_f16", "paper", paper, multiply, None, None, None, "f16"),
         ("context", "context", context, multiply, None, None, None, "f32"),
         ("heatmap", "context", heatmap, multiply, None, None, None, "f32"),
         ("zoom", "context", heatmap, ramp, None, view, None, "f32"), ("arm", "paper", paper, multiply, None, None, ARM, "f32"),
-        ("second_look", "context", heatmap, beside, closer, view, None, "f32"),
+        ("coarse", "context", heatmap, beside, closer, view, None, "f32"),
     ):
         image = torch.rand((3, height, width), generator=torch.Generator().manual_seed(seed))
         mask, joint = _networks(seed, image, mask_layers, joint_layers)
+        networks = {"mask": mask, "joint": joint}
+        if mask_zoom:
+            coarse = Network(COARSE_LAYERS, MASK_INPUT, tuple(image.shape))
+            with torch.no_grad():
+                # As of the mask network: a mask that is nearly the same all over would hide a wrong layer.
+                coarse.conv3.weight *= 20
+            networks = {"coarse": coarse, **networks}
         if arm:
             with torch.no_grad():
                 joint.dense.weight *= 0.02
                 joint.dense.bias[:] = torch.tensor(ARM_JOINTS)
         description = describe(
-            mask_layers, joint_layers, family=family, robot="golden", overlay=rule, zoom=view, second_look=second_look,
-            arm=arm, width=width, height=height,
+            {name: network.layers for name, network in networks.items()}, family=family, robot="golden", overlay=rule,
+            mask_zoom=mask_zoom, zoom=view, arm=arm, width=width, height=height,
             camera={"fx": 14.25, "fy": 14.25, "cx": (width - 1) / 2, "cy": (height - 1) / 2},
             presence={"mask_threshold": 0.5, "sure_threshold": 0.7, "min_sure": 0.01}, card=CARD)
         path = folder / f"{name}.safetensors"
-        write_model(path, mask, joint, description, dtype)
+        write_model(path, networks, description, dtype)
         values = cascade_activations(*read_model(path), image)
-        margin = (values["mask.mask"] - 0.5).abs().min().item()
+        # Behind a coarse mask, nothing is told by a threshold.
+        margin = 1.0 if mask_zoom else (values["mask.mask"] - 0.5).abs().min().item()
         if margin < 1e-3:
             raise ValueError(f"a pixel of the mask is {margin:.1e} from the threshold: take another seed")
         save_file(values, folder / f"{name}.activations.safetensors")

@@ -63,6 +63,20 @@ def context_mask_layers():
     ]
 
 
+def coarse_mask_layers():
+    """The context family's coarse network, which tells its mask network where to look: that one's first layers, and a mask at a
+    quarter of the resolution."""
+    layers = context_mask_layers()[:7]
+    return layers + [
+        {"name": "wide", "op": "conv2d", "inputs": [layers[-1]["name"]], "out_channels": 24, "kernel": 3, "dilation": 8,
+         "activation": "relu"},
+        {"name": "logit", "op": "conv2d", "inputs": ["wide"], "out_channels": 1, "kernel": 1, "dilation": 1,
+         "activation": "none"},
+        {"name": "up1", "op": "upsample2d", "inputs": ["logit"], "scale": 4},
+        {"name": "mask", "op": "sigmoid", "inputs": ["up1"]},
+    ]
+
+
 def paper_joint_layers(dilations=(1, 1, 1), pool=2, outputs=18):
     """The paper's joint network: convolutions of 32, 64 and 128 filters, max-pooling between, and a dense layer."""
     layers, source = [], JOINT_INPUT

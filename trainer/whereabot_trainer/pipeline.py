@@ -9,8 +9,10 @@ from pathlib import Path
 
 from . import data
 
-# Shares of the time. The mask network is the larger one; what robots have in common is most of what there is to learn.
-MASK, COMMON = 0.45, 0.6
+# Shares of the time. The mask network is the largest one, the coarse network, the context family's, the smallest; what robots have in
+# common is most of what there is to learn.
+MASK, COARSE, COMMON = 0.35, 0.1, 0.6
+JOINT = 1 - MASK - COARSE
 VALIDATION_SAMPLES = 100
 
 
@@ -53,33 +55,41 @@ def steps(args):
         commands.append([command, "--family", args.family, *recordings(robots), "--out", str(out / run), "--minutes",
                          f"{minutes:.4g}", "--cache", args.cache, "--seed", str(args.seed), *camera, *flags, *resume])
 
-    def joint(run, mask, robots, minutes, *flags):
-        step("train-joint", run, robots, minutes, "--mask-run", str(out / mask), "--estimated-masks", "0.5", *flags)
+    context = args.family == "context"
 
-    if args.family == "context":
-        views = ["--crop", "224", "184", "--zoom", "0.4", "2.0"]
-    else:
-        views = ["--crop", "192", "160"]
-    if args.negatives:
-        views += ["--negatives", *args.negatives]
+    def masks(suffix, robots, minutes):
+        negatives = ["--negatives", *args.negatives] if args.negatives else []
+        if not context:
+            step("train-mask", f"mask{suffix}", robots, (MASK + COARSE) * minutes, "--crop", "192", "160", *negatives)
+            return
+        step("train-mask", f"mask{suffix}", robots, MASK * minutes, "--crop", "224", "184", "--zoom", "0.4", "2.0", *negatives)
+        # What it sees is not turned: whole images, nearly.
+        step("train-mask", f"coarse{suffix}", robots, COARSE * minutes, "--coarse", "--init-from", str(out / f"mask{suffix}"),
+             "--crop", "224", "184", "--zoom", "0.6", "1.6", *negatives)
+
+    def joint(run, suffix, robots, minutes, *flags):
+        coarse = ["--coarse-run", str(out / f"coarse{suffix}")] if context else []
+        step("train-joint", run, robots, minutes, "--mask-run", str(out / f"mask{suffix}"), *coarse, "--estimated-masks", "0.5",
+             *flags)
+
     robots = list(by_robot)
-    shared = args.family == "context" and len(robots) > 1
+    shared = context and len(robots) > 1
     if shared:
         # The arms look alike but for their size, which the network's unit takes out.
-        step("train-mask", "mask", robots, MASK * args.minutes, *views)
-        joint("joint", "mask", robots, (1 - MASK) * COMMON * args.minutes)
+        masks("", robots, args.minutes)
+        joint("joint", "", robots, JOINT * COMMON * args.minutes)
         for robot in robots:
-            joint(f"joint-{robot}", "mask", [robot], (1 - MASK) * (1 - COMMON) * args.minutes / len(robots),
+            joint(f"joint-{robot}", "", [robot], JOINT * (1 - COMMON) * args.minutes / len(robots),
                   "--init-from", str(out / "joint"), "--learning-rate", "5e-4", "2e-5")
     else:
         for robot in robots:
-            step("train-mask", f"mask-{robot}", [robot], MASK * args.minutes / len(robots), *views)
-            joint(f"joint-{robot}", f"mask-{robot}", [robot], (1 - MASK) * args.minutes / len(robots))
+            masks(f"-{robot}", [robot], args.minutes / len(robots))
+            joint(f"joint-{robot}", f"-{robot}", [robot], JOINT * args.minutes / len(robots))
     for robot in robots:
-        mask = "mask" if shared else f"mask-{robot}"
-        of = robots if shared else [robot]
+        suffix, of = ("", robots) if shared else (f"-{robot}", [robot])
         source = validation(of) or ["--recording", *by_robot[robot][0]]
-        commands.append(["export", "--mask", str(out / mask), "--joint", str(out / f"joint-{robot}"), *source,
+        coarse = ["--coarse", str(out / f"coarse{suffix}")] if context else []
+        commands.append(["export", "--mask", str(out / f"mask{suffix}"), *coarse, "--joint", str(out / f"joint-{robot}"), *source,
                          "--robot", robot, "--cache", args.cache, "--seed", str(args.seed),
                          "--out", str(out / f"{robot}.safetensors"), "--dtype", args.dtype])
     return commands

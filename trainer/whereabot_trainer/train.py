@@ -13,8 +13,8 @@ from tqdm import tqdm
 from . import data, evaluate, losses, zoom
 from .model import read_model
 from .networks import (
-    JOINT_INPUT, JOINTS, MASK_INPUT, OVERLAYS, Network, context_mask_layers, heatmap_joint_layers, overlay, paper_joint_layers,
-    paper_mask_layers)
+    JOINT_INPUT, JOINTS, MASK_INPUT, OVERLAYS, Network, coarse_mask_layers, context_mask_layers, heatmap_joint_layers, overlay,
+    paper_joint_layers, paper_mask_layers)
 
 
 # --- the loop --------------------------------------------------------------------------------------------------------
@@ -281,14 +281,19 @@ def load_network(run):
     return network.eval().fold_normalisation(), state
 
 
-def load_mask(path):
-    """(the mask network, its family) of a run's folder, calibrated, or of a model file, which is; in eval mode."""
-    if not Path(path).is_dir():
-        mask, _, description = read_model(path)
-        return mask, description["family"]
-    network, state = load_network(path)
-    evaluate.shift_logits(network, state["figures"]["logit_shift"])
-    return network, state["card"]["family"]
+def load_masks(mask, coarse):
+    """(the mask network, the coarse network or None) of the runs' folders, calibrated, or of model files, which are; in eval mode.
+    Without `coarse`, a model file's own."""
+    def calibrated(run):
+        network, state = load_network(run)
+        evaluate.shift_logits(network, state["figures"]["logit_shift"])
+        return network
+
+    def networks(path, part):
+        return {part: calibrated(path)} if Path(path).is_dir() else read_model(path)[0]
+
+    found = networks(mask, "mask")
+    return found["mask"], networks(coarse, "coarse")["coarse"] if coarse else found.get("coarse")
 
 
 @torch.no_grad()
@@ -318,15 +323,25 @@ def start_from(network, tensors, images):
 
 
 def starting_tensors(path, part):
-    """(the state dict of the `part`, mask or joint, card) of a run's folder or of a model file."""
+    """(the state dict of the `part`, coarse, mask or joint, card) of a run's folder or of a model file; of one without a coarse network,
+    the mask network's."""
     if Path(path).is_dir():
         network, state = load_network(path)
         return network.state_dict(), state["card"]
-    mask, joint, description = read_model(path)
-    return {"mask": mask, "joint": joint}[part].state_dict(), description["card"]
+    networks, description = read_model(path)
+    return networks[part if part in networks else "mask"].state_dict(), description["card"]
 
 
 # --- the mask network ------------------------------------------------------------------------------------------------
+
+def mask_layers(args):
+    """Of the network that the command's flags ask for."""
+    if args.coarse:
+        if args.family != "context":
+            raise SystemExit("--coarse: expected --family context: the paper's has one mask network")
+        return coarse_mask_layers()
+    return context_mask_layers() if args.family == "context" else paper_mask_layers(args.dilations, args.kernel)
+
 
 def train_mask(args):
     state = kept_state(args)
@@ -336,10 +351,14 @@ def train_mask(args):
     height, width = args.crop[1], args.crop[0]
     card |= {"family": args.family, "foreground_share": share, "w_fg": w_fg, "w_bg": w_bg,
              "crop": args.crop, "camera": args.camera, **({"zoom": args.zoom} if args.camera == "free" else {})}
-    layers = context_mask_layers() if args.family == "context" else paper_mask_layers(args.dilations, args.kernel)
-    network = initialise(Network(layers, MASK_INPUT, normalise=args.normalise))
+    network = initialise(Network(mask_layers(args), MASK_INPUT, normalise=args.normalise))
     if args.init_from:
-        start_from(network, starting_tensors(args.init_from, "mask")[0], samples.pixels(numbers[:: len(numbers) // 64 + 1])[0])
+        tensors = starting_tensors(args.init_from, "coarse" if args.coarse else "mask")[0]
+        if args.coarse:
+            # A mask network's first layers are like its own.
+            own = network.state_dict()
+            tensors = {key: tensor for key, tensor in tensors.items() if key in own and own[key].shape == tensor.shape}
+        start_from(network, tensors, samples.pixels(numbers[:: len(numbers) // 64 + 1])[0])
         card |= {"init_from": Path(args.init_from).name}
     network = network.to(args.device, memory_format=torch.channels_last)
 
@@ -511,13 +530,11 @@ def train_joint(args):
         card |= {"init_from": Path(args.init_from).name}
     network = network.to(args.device, memory_format=torch.channels_last)
 
-    mask_network = second_look = held_out_estimated = None
+    mask_network = coarse = held_out_estimated = None
     if args.mask_run:
-        mask_network, mask_family = load_mask(args.mask_run)
-        mask_network = mask_network.to(args.device, memory_format=torch.channels_last)
-        # As export will have it, whatever a model file had.
-        second_look = zoom.second_look_of(mask_family)
-        held_out_estimated = evaluate.estimate_masks(mask_network, held_out, validation, args.device, second_look)
+        mask_network, coarse = (network and network.to(args.device, memory_format=torch.channels_last)
+                                for network in load_masks(args.mask_run, args.coarse_run))
+        held_out_estimated = evaluate.estimate_masks(mask_network, held_out, validation, args.device, coarse)
     elif args.estimated_masks > 0:
         raise SystemExit("--estimated-masks needs --mask-run")
 
@@ -527,7 +544,7 @@ def train_joint(args):
         images = data.jitter_some_colours(images)
         rows = torch.rand(len(batch)) < (args.estimated_masks if progress >= args.estimated_after else 0)
         if rows.any():
-            estimates = evaluate.masks_of(mask_network, images[rows], second_look, args.precision == "bf16")
+            estimates = evaluate.masks_of(mask_network, images[rows], coarse, args.precision == "bf16")
             moved = torch.rand(len(estimates)) < data.VARIED
             if moved.any():
                 estimates[moved] = data.jitter_masks(estimates[moved])

@@ -1,5 +1,5 @@
-"""The joint network's camera: at the place of the canonical one, but turned towards the robot and zoomed in on it. The mask
-network's second look is through such a camera, too.
+"""The joint network's camera: at the place of the canonical one, but turned towards the robot and zoomed in on it. Behind a coarse
+network, the mask network looks through such a camera, too.
 
 An arm is then seen in the middle of the picture and at about the same size, wherever it is in the image. The turn is a
 rotation and the zoom a focal length, so that what is seen is exact for a pinhole; the network's depths are those of the
@@ -13,15 +13,10 @@ from .networks import CAMERA, share
 # The picture's side spans so many standard deviations of the mask: nineteen arms in twenty are seen whole.
 ZOOM = {"spread": 5.0, "least": 0.5, "most": 4.0}
 # The mask network's: never out, and in no farther than the pictures that it is trained on are enlarged.
-SECOND_LOOK = {"spread": 4.5, "least": 1.0, "most": 2.0}
-# What it looks at: the mask, each pixel as heavy as it is probable. A share of it that rose steeply would turn the camera by
-# roundings: a look in 16-bit floats, joints moved by millimetres.
+MASK_ZOOM = {"spread": 4.5, "least": 1.0, "most": 2.0}
+# What it looks at: the coarse mask, each pixel as heavy as it is probable. A share of it that rose steeply would turn the camera
+# by roundings: a look in 16-bit floats, joints moved by millimetres.
 LOOKED_AT = {"rule": "multiply"}
-
-
-def second_look_of(family):
-    """How the family's mask network looks a second time; None where it looks once."""
-    return SECOND_LOOK if family == "context" else None
 
 
 def look_at(masks, zoom, rule, camera=CAMERA):
@@ -78,14 +73,14 @@ def see(images, rotations, zooms, camera=CAMERA):
     return _sample(images, ray @ (k @ rotations.mT).mT)
 
 
-def merge(first, second, rotations, zooms, camera=CAMERA):
-    """The canonical camera's masks [N, 1, H, W]: `second`, which those cameras see, and beyond their view `first`. At a view's
+def merge(coarse, closer, rotations, zooms, camera=CAMERA):
+    """The canonical camera's masks [N, 1, H, W]: `closer`, which those cameras see, and beyond their view `coarse`. At a view's
     border, where a bilinear sample is partly beyond, they share."""
-    k, ray = _pinhole(first, camera)
+    k, ray = _pinhole(coarse, camera)
     turned = torch.cat([ray, torch.ones_like(ray[..., :1])], 2) @ rotations.mT
     seen = torch.cat([turned[..., :2] * zooms[:, None, None], turned[..., 2:]], 2)
-    second, within = _sample(torch.cat([second, torch.ones_like(second)], 1), seen @ k.mT).split(1, 1)
-    return second + (1 - within) * first
+    closer, within = _sample(torch.cat([closer, torch.ones_like(closer)], 1), seen @ k.mT).split(1, 1)
+    return closer + (1 - within) * coarse
 
 
 def _pinhole(images, camera):
