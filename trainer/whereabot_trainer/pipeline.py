@@ -65,7 +65,7 @@ def steps(args):
         step("train-mask", f"mask{suffix}", robots, MASK * minutes, "--crop", "224", "184", "--zoom", "0.4", "2.0", *negatives)
         # What it sees is not turned: whole images, nearly.
         step("train-mask", f"coarse{suffix}", robots, COARSE * minutes, "--coarse", "--init-from", str(out / f"mask{suffix}"),
-             "--crop", "224", "184", "--zoom", "0.6", "1.6", *negatives)
+             "--crop", "224", "184", "--zoom", "0.5", "1.8", *negatives)
 
     def joint(run, suffix, robots, minutes, *flags):
         coarse = ["--coarse-run", str(out / f"coarse{suffix}")] if context else []
