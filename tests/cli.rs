@@ -686,6 +686,11 @@ fn weights_are_looked_for_and_the_places_told() {
         message.contains("weights/cube.safetensors") && message.contains("WHEREABOT_WEIGHTS"),
         "{message}"
     );
+    // Those beside the program.
+    assert!(
+        message.contains("`cube`; there are weights for ") && message.contains("ur5"),
+        "{message}"
+    );
     std::fs::create_dir(bench.path("elsewhere")).unwrap();
     std::fs::copy(
         bench.path("model.safetensors"),

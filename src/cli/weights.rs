@@ -1,5 +1,6 @@
 //! Where model files are.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
@@ -60,12 +61,29 @@ fn find(robot: &str) -> anyhow::Result<PathBuf> {
         .find(|place| place.is_file())
         .cloned()
         .with_context(|| {
+            let there = match robots().as_slice() {
+                [] => String::new(),
+                robots => format!("; there are weights for {}", robots.join(", ")),
+            };
             format!(
-                "no weights for robot `{robot}`: give --weights FILE, or name their folder in \
+                "no weights for robot `{robot}`{there}: give --weights FILE, or name their folder in \
                  WHEREABOT_WEIGHTS; looked for:{}",
                 list()
             )
         })
+}
+
+/// Those that there are model files of, in any of the folders.
+fn robots() -> Vec<String> {
+    let files = folders()
+        .into_iter()
+        .filter_map(|folder| folder.read_dir().ok());
+    let paths = files.flatten().flatten().map(|file| file.path());
+    let models = paths.filter(|path| path.extension().is_some_and(|e| e == "safetensors"));
+    let robots: BTreeSet<String> = models
+        .filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned()))
+        .collect();
+    robots.into_iter().collect()
 }
 
 fn folders() -> Vec<PathBuf> {
