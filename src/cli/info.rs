@@ -42,8 +42,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 
 fn card(model: &Model, file_size: usize) -> String {
     let description = &model.description;
-    let macs = model.networks().map(Network::macs).sum();
-    let parameters: usize = model.networks().map(Network::parameter_count).sum();
+    let networks = || model.networks().map(|(_, network)| network);
+    let macs = networks().map(Network::macs).sum();
+    let parameters: usize = networks().map(Network::parameter_count).sum();
     let overlay = match description.overlay {
         Overlay::Multiply {} => "colour times mask".to_owned(),
         Overlay::Threshold { threshold } => {
@@ -103,9 +104,7 @@ fn card(model: &Model, file_size: usize) -> String {
         millions(macs),
         file_size / 1024,
     );
-    let names = ["coarse network", "mask network", "joint network"];
-    let first = names.len() - model.networks().count();
-    for (name, network) in names.iter().skip(first).zip(model.networks()) {
+    for (name, network) in model.networks() {
         text += &layers(name, network);
     }
     if let Some(entries) = description.card.as_object().filter(|card| !card.is_empty()) {
@@ -119,7 +118,7 @@ fn card(model: &Model, file_size: usize) -> String {
 
 fn layers(name: &str, network: &Network) -> String {
     let mut text = format!(
-        "\n{name}: {} to {}, {} MMAC, {} parameters\n",
+        "\n{name} network: {} to {}, {} MMAC, {} parameters\n",
         network.input(),
         network.output(),
         millions(network.macs()),

@@ -82,7 +82,8 @@ impl Plan {
         if batch == 0 {
             return Err(GpuError::Zero { what: "batch" });
         }
-        let layers = model.networks().map(|network| network.nodes().len()).sum();
+        let networks = model.networks();
+        let layers = networks.map(|(_, network)| network.nodes().len()).sum();
         let mut done = 0;
         let mut planned = || {
             done += 1;

@@ -169,10 +169,13 @@ impl Model {
         })
     }
 
-    /// The networks, in the order in which they run.
-    pub fn networks(&self) -> impl Iterator<Item = &Network> {
-        let networks = [&self.mask_network, &self.joint_network];
-        self.coarse_network.iter().chain(networks)
+    /// The networks by their names, in the order in which they run.
+    pub fn networks(&self) -> impl Iterator<Item = (&'static str, &Network)> {
+        let coarse = self
+            .coarse_network
+            .iter()
+            .map(|network| ("coarse", network));
+        coarse.chain([("mask", &self.mask_network), ("joint", &self.joint_network)])
     }
 
     /// The coarse network and what its mask turns, where there is one.

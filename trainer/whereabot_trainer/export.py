@@ -11,7 +11,7 @@ import torch
 
 from . import __version__, data, evaluate, kinematic_fit, zoom
 from .model import describe, read_model, write_model
-from .train import MIN_COVERAGE, kept_arm_lengths, load_network, output_unit
+from .train import MIN_COVERAGE, kept_arm_lengths, load_coarse, load_network, output_unit
 
 # From fewer samples the errors of six joints cannot be told.
 LEAST_LEARNED = 30
@@ -70,7 +70,8 @@ def export_runs(args):
     kept, kept_description = read_model(mask_file) if mask_file else ({}, {})
     mask, _, mask_mean = _mean_of(args.mask) if not mask_file else (kept["mask"], None, {})
     joint, joint_state, joint_mean = _mean_of(args.joint) if not joint_file else (read_model(joint_file)[0]["joint"], None, {})
-    coarse, coarse_card = _coarse(args.coarse) if args.coarse else (kept.get("coarse"), _coarse_card(kept_description))
+    coarse = load_coarse(args.coarse) if args.coarse else kept.get("coarse")
+    coarse_card = _coarse_card(args.coarse or mask_file) if coarse else {}
     mask_card, joint_card = _mask_card(args.mask[-1]), _joint_card(args.joint[-1])
     family, rules = mask_card["mask_training"]["family"], (joint_card["overlay"], joint_card["zoom"])
 
@@ -182,23 +183,12 @@ MASK_CURVES = {"accuracy": "mask_accuracy"}
 JOINT_CURVES = {"true_mask_mean_cm": "true_mask_cm", "estimated_mask_mean_cm": "estimated_mask_cm"}
 
 
-def _coarse(path):
-    """(the coarse network, calibrated, what the card says of it) of a run's folder or, as it stands there, of a model file."""
-    file = _model_file([path])
-    if file:
-        networks, description = read_model(file)
-        if "coarse" not in networks:
-            raise SystemExit(f"--coarse: {file} has no coarse network")
-        return networks["coarse"], _coarse_card(description)
-    network, state = load_network(path)
-    shift = state["figures"]["logit_shift"]
-    evaluate.shift_logits(network, shift)
-    return network, {"coarse_training": _training(state) | {"logit_shift": shift}}
-
-
-def _coarse_card(description):
-    """What a model file's card says of its coarse network."""
-    return {key: value for key, value in description.get("card", {}).items() if key == "coarse_training"}
+def _coarse_card(path):
+    """What the card says of the coarse network of a run's folder or, as it stands there, of a model file; {} where there is none."""
+    if not Path(path).is_dir():
+        return {key: value for key, value in read_model(path)[1]["card"].items() if key == "coarse_training"}
+    state = load_network(path)[1]
+    return {"coarse_training": _training(state) | {"logit_shift": state["figures"]["logit_shift"]}}
 
 
 def _mask_card(path):

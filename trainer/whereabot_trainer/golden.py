@@ -30,17 +30,6 @@ MASK_LAYERS = [
      "activation": "none"},
     {"name": "mask", "op": "sigmoid", "inputs": ["conv4"]},
 ]
-COARSE_LAYERS = [
-    {"name": "conv1", "op": "conv2d", "inputs": ["image"], "out_channels": 5, "kernel": 3, "dilation": 1,
-     "activation": "relu"},
-    {"name": "pool1", "op": "max_pool2d", "inputs": ["conv1"], "size": 2},
-    {"name": "conv2", "op": "conv2d", "inputs": ["pool1"], "out_channels": 7, "kernel": 3, "dilation": 3,
-     "activation": "relu"},
-    {"name": "conv3", "op": "conv2d", "inputs": ["conv2"], "out_channels": 1, "kernel": 1, "dilation": 1,
-     "activation": "none"},
-    {"name": "up1", "op": "upsample2d", "inputs": ["conv3"], "scale": 2},
-    {"name": "mask", "op": "sigmoid", "inputs": ["up1"]},
-]
 # 14 x 20 pools by 2 to 7 x 10, and by 3 to 2 x 3: a row and a column are left over.
 JOINT_LAYERS = [
     {"name": "conv1", "op": "conv2d", "inputs": ["overlay"], "out_channels": 5, "kernel": 3, "dilation": 2,
@@ -72,6 +61,15 @@ CONTEXT_LAYERS = [
     {"name": "logit", "op": "conv2d", "inputs": ["skip2"], "out_channels": 1, "kernel": 3, "dilation": 1,
      "activation": "none"},
     {"name": "mask", "op": "sigmoid", "inputs": ["logit"]},
+]
+COARSE_LAYERS = [
+    *CONTEXT_LAYERS[:2],
+    {"name": "conv2", "op": "conv2d", "inputs": ["pool1"], "out_channels": 7, "kernel": 3, "dilation": 3,
+     "activation": "relu"},
+    {"name": "conv3", "op": "conv2d", "inputs": ["conv2"], "out_channels": 1, "kernel": 1, "dilation": 1,
+     "activation": "none"},
+    {"name": "up1", "op": "upsample2d", "inputs": ["conv3"], "scale": 2},
+    {"name": "mask", "op": "sigmoid", "inputs": ["up1"]},
 ]
 # 7 rows and 10 columns of cells, sharp enough for a place to show; joints and hidden features share a block of four.
 HEATMAP_LAYERS = [

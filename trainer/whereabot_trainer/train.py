@@ -284,16 +284,26 @@ def load_network(run):
 def load_masks(mask, coarse):
     """(the mask network, the coarse network or None) of the runs' folders, calibrated, or of model files, which are; in eval mode.
     Without `coarse`, a model file's own."""
-    def calibrated(run):
-        network, state = load_network(run)
-        evaluate.shift_logits(network, state["figures"]["logit_shift"])
-        return network
+    found = {"mask": _calibrated(mask)} if Path(mask).is_dir() else read_model(mask)[0]
+    return found["mask"], load_coarse(coarse) if coarse else found.get("coarse")
 
-    def networks(path, part):
-        return {part: calibrated(path)} if Path(path).is_dir() else read_model(path)[0]
 
-    found = networks(mask, "mask")
-    return found["mask"], networks(coarse, "coarse")["coarse"] if coarse else found.get("coarse")
+def load_coarse(path):
+    """The coarse network of a run's folder, calibrated, or of a model file, which is; in eval mode."""
+    if Path(path).is_dir():
+        return _calibrated(path)
+    if not Path(path).exists():
+        raise SystemExit(f"expected the folder of a run or a model file, found {path}")
+    networks = read_model(path)[0]
+    if "coarse" not in networks:
+        raise SystemExit(f"{path} has no coarse network")
+    return networks["coarse"]
+
+
+def _calibrated(run):
+    network, state = load_network(run)
+    evaluate.shift_logits(network, state["figures"]["logit_shift"])
+    return network
 
 
 @torch.no_grad()
