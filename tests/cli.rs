@@ -691,6 +691,8 @@ fn weights_are_looked_for_and_the_places_told() {
         message.contains("`cube`; there are weights for ") && message.contains("ur5"),
         "{message}"
     );
+    // The paper's file is a UR5's, too: no robot has its name.
+    assert!(!message.contains("ur5-paper"), "{message}");
     std::fs::create_dir(bench.path("elsewhere")).unwrap();
     std::fs::copy(
         bench.path("model.safetensors"),

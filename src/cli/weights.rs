@@ -73,15 +73,23 @@ fn find(robot: &str) -> anyhow::Result<PathBuf> {
         })
 }
 
-/// Those that there are model files of, in any of the folders.
+/// Those whose model is in one of the folders, in a file of the robot's name.
 fn robots() -> Vec<String> {
     let files = folders()
         .into_iter()
         .filter_map(|folder| folder.read_dir().ok());
-    let paths = files.flatten().flatten().map(|file| file.path());
-    let models = paths.filter(|path| path.extension().is_some_and(|e| e == "safetensors"));
-    let robots: BTreeSet<String> = models
-        .filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned()))
+    let robots: BTreeSet<String> = files
+        .flatten()
+        .flatten()
+        .filter_map(|file| {
+            let robot = file
+                .file_name()
+                .to_str()?
+                .strip_suffix(".safetensors")?
+                .to_owned();
+            let model = Model::load(file.path()).ok()?;
+            (model.description.robot == robot).then_some(robot)
+        })
         .collect();
     robots.into_iter().collect()
 }
