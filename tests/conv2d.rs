@@ -4,8 +4,8 @@
 mod common;
 
 use common::{
-    check_in_buffers, check_layer, check_network_by, device, difference, in_halves, network, noise,
-    on_gpu, on_gpu_by, on_reference, one_layer, rounding,
+    check_folded, check_layer, check_network_by, device, difference, in_halves, narrow_device,
+    network, noise, on_gpu, on_gpu_by, on_reference, one_layer, rounding,
 };
 use proptest::prelude::*;
 use whereabot::gpu::{Conv2dKernel, Layout, NetworkPlan};
@@ -93,7 +93,7 @@ proptest! {
             let network = one_layer(conv2d(out_channels, side, dilation, activation), input, seed.into());
             let tolerance = rounding(channels * side * side);
             for &layout in kernel.layouts() {
-                check_network_by(layout, Some(kernel), &network, batch, seed.into(), tolerance);
+                check_network_by(&device(), layout, Some(kernel), &network, batch, seed.into(), tolerance);
             }
         }
     }
@@ -108,7 +108,7 @@ fn each_kernel_notices_a_wrong_weight() {
         let network = one_layer(conv2d(out_channels, 3, 2, Activation::None), input, 1);
         let other = common::with_one_weight_changed(&network, 2e-2);
         for &layout in kernel.layouts() {
-            let gpu = on_gpu_by(layout, Some(kernel), &network, 2, &values);
+            let gpu = on_gpu_by(&device(), layout, Some(kernel), &network, 2, &values);
             let (right, wrong) = match layout {
                 Layout::HalfBuffer => (2e-3, 4e-3),
                 Layout::Buffer | Layout::Texture => (1e-5, 1e-3),
@@ -174,7 +174,7 @@ proptest! {
         let tolerance = rounding(channels * side * side);
         for kernel in kernels().into_iter().filter(|kernel| channels_for(*kernel, 2) > 1) {
             for &layout in kernel.layouts() {
-                check_network_by(layout, Some(kernel), &network, batch, seed.into(), tolerance);
+                check_network_by(&device(), layout, Some(kernel), &network, batch, seed.into(), tolerance);
             }
         }
     }
@@ -202,7 +202,14 @@ fn a_max_pool_is_made_with_the_convolution_that_nothing_else_reads() {
     let network = with_pool(conv2d(5, 3, 1, Activation::None), 2, input, false, 1);
     let other = common::with_one_weight_changed(&network, 1e-2);
     let values = noise(input.len(), 2);
-    let gpu = on_gpu_by(Layout::Texture, Some(kernel), &network, 1, &values);
+    let gpu = on_gpu_by(
+        &device(),
+        Layout::Texture,
+        Some(kernel),
+        &network,
+        1,
+        &values,
+    );
     assert!(difference(&gpu, &on_reference(&network, &values)).unwrap() < 1e-5);
     assert!(difference(&gpu, &on_reference(&other, &values)).unwrap() > 1e-3);
 }
@@ -231,10 +238,12 @@ fn layers_of_the_paper_agree() {
 
 #[test]
 fn more_workgroups_than_one_dimension_holds() {
-    // An invocation makes four columns of a row, a workgroup 64 times that.
-    let input = Shape::new(1, 65_536 * 64 + 5, 1);
-    let network = one_layer(conv2d(1, 1, 1, Activation::None), input, 11);
-    check_in_buffers(&network, 11, 1e-6);
+    let here = narrow_device(16);
+    for kernel in kernels().into_iter().filter(|kernel| kernel.runs_on(&here)) {
+        let operation = conv2d(channels_for(kernel, 8), 3, 1, Activation::None);
+        let network = one_layer(operation, Shape::new(3, 83, 107), 11);
+        check_folded(&network, Some(kernel), rounding(27));
+    }
 }
 
 #[test]

@@ -58,6 +58,25 @@ pub fn device() -> Arc<Device> {
     }))
 }
 
+/// A device of the same adapter whose dispatches hold `workgroups` a dimension: what a real one folds only at millions of
+/// texels, it folds at hundreds.
+pub fn narrow_device(workgroups: u32) -> Device {
+    let instance =
+        wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle_from_env());
+    let adapter = pollster::block_on(instance.request_adapter(&Default::default()))
+        .expect("an adapter is needed: install mesa-vulkan-drivers");
+    let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
+        required_features: adapter.features() & wgpu::Features::SUBGROUP,
+        required_limits: wgpu::Limits {
+            max_compute_workgroups_per_dimension: workgroups,
+            ..adapter.limits()
+        },
+        ..Default::default()
+    }))
+    .unwrap();
+    Device::from_host(device, queue).unwrap()
+}
+
 /// A driver that `scripts/drivers` runs tests on, each with differences that `tests/drivers.rs` expects.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Driver {
@@ -126,29 +145,25 @@ pub fn in_halves(values: &[f32]) -> Vec<f32> {
 
 /// What the GPU makes of a batch `[image][channel][row][column]`, in the layout that suits it.
 pub fn on_gpu(network: &Network, batch: usize, values: &[f32]) -> Vec<f32> {
-    on_gpu_by(
-        device().layout(Precision::F32).unwrap(),
-        None,
-        network,
-        batch,
-        values,
-    )
+    let device = device();
+    let layout = device.layout(Precision::F32).unwrap();
+    on_gpu_by(&device, layout, None, network, batch, values)
 }
 
 /// What the GPU makes of it in `layout`, all convolutions by one `kernel`, if it is given.
 pub fn on_gpu_by(
+    device: &Device,
     layout: Layout,
     kernel: Option<Conv2dKernel>,
     network: &Network,
     batch: usize,
     values: &[f32],
 ) -> Vec<f32> {
-    let device = device();
-    let input = NetworkPlan::input(&device, layout, "input", network, batch).unwrap();
-    input.write(&device, values).unwrap();
-    let plan = NetworkPlan::with_kernel(&device, "test", network, &input, kernel).unwrap();
-    plan.run(&device).unwrap();
-    plan.output().read(&device).unwrap()
+    let input = NetworkPlan::input(device, layout, "input", network, batch).unwrap();
+    input.write(device, values).unwrap();
+    let plan = NetworkPlan::with_kernel(device, "test", network, &input, kernel).unwrap();
+    plan.run(device).unwrap();
+    plan.output().read(device).unwrap()
 }
 
 /// What the reference makes of the same.
@@ -200,18 +215,30 @@ pub fn check_layer(operation: Operation, input: Shape, batch: usize, seed: u64, 
 /// Holds the GPU's network to the reference, in every layout.
 pub fn check_network(network: &Network, batch: usize, seed: u64, tolerance: f32) {
     for layout in Layout::ALL {
-        check_network_by(layout, None, network, batch, seed, tolerance);
+        check_network_by(&device(), layout, None, network, batch, seed, tolerance);
     }
 }
 
-/// Holds the GPU's network to the reference, in buffers: for more channels than a texture has layers.
-pub fn check_in_buffers(network: &Network, seed: u64, tolerance: f32) {
-    check_network_by(Layout::Buffer, None, network, 1, seed, tolerance);
+/// Holds the GPU's network to the reference where it takes more than 16 workgroups and a dimension holds 16: in every
+/// layout, all convolutions by one `kernel`, if it is given.
+pub fn check_folded(network: &Network, kernel: Option<Conv2dKernel>, tolerance: f32) {
+    let (device, narrower) = (narrow_device(16), narrow_device(4));
+    let layouts = kernel.map_or(&Layout::ALL[..], Conv2dKernel::layouts);
+    for &layout in layouts {
+        // Negative control: four rows of four do not hold them.
+        let input = NetworkPlan::input(&narrower, layout, "input", network, 1).unwrap();
+        let plan = NetworkPlan::with_kernel(&narrower, "test", network, &input, kernel);
+        let refused = plan.unwrap_err().to_string();
+        assert!(refused.contains("workgroups"), "{layout:?}: {refused}");
+
+        check_network_by(&device, layout, kernel, network, 1, 3, tolerance);
+    }
 }
 
 /// Holds the GPU's network to the reference, in `layout`, all convolutions by one `kernel`, if it is
 /// given. In halves, the input can be held, and the output is rounded.
 pub fn check_network_by(
+    device: &Device,
     layout: Layout,
     kernel: Option<Conv2dKernel>,
     network: &Network,
@@ -224,7 +251,7 @@ pub fn check_network_by(
     if layout == Layout::HalfBuffer {
         values = in_halves(&values);
     }
-    let gpu = on_gpu_by(layout, kernel, network, batch, &values);
+    let gpu = on_gpu_by(device, layout, kernel, network, batch, &values);
     let expected = on_reference(network, &values);
     let greatest = expected.iter().fold(0.0_f32, |most, v| most.max(v.abs()));
     let rounding = if layout == Layout::HalfBuffer {
