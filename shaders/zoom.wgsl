@@ -1,12 +1,14 @@
-// Turns the joint network's camera to what the overlay shows of each image and zooms in on it: to the mean of the pixels,
-// each as heavy as it is shown, so close that SPREAD of their standard deviations are as wide or as high as the image. A
-// workgroup an image, which adds up every GROUPth pixel in each invocation: always in the same order.
+// Turns a network's camera to what the overlay shows of each image and zooms in on it: to the mean of the pixels,
+// each as heavy as it is shown, so close that SPREAD of their standard deviations are as wide or as high as the image, both
+// in steps, which roundings and noise do not take. A workgroup an image, which adds up every GROUPth pixel in each invocation: always in the same order.
 
 override SPREAD: f32;
 override LEAST: f32;
 override MOST: f32;
 
 const GROUP = 256u;
+// Of the zoom, in an octave; of the direction, in the width of what the camera sees.
+const STEPS = vec2(8.0, 64.0);
 override PIXELS: u32 = INPUT_WIDTH * INPUT_HEIGHT;
 
 // [image]
@@ -56,8 +58,11 @@ fn main(
     let means = sums[0] / weights[0];
     let deviation = sqrt(max(means.zw - means.xy * means.xy, vec2(0.0)));
     let share = SPREAD * deviation / size;
-    let zoom = clamp(1.0 / max(max(share.x, share.y), 1e-6), LEAST, MOST);
-    let ray = normalize(vec3((means.xy + middle - vec2(CX, CY)) / vec2(FX, FY), 1.0));
+    let wanted = clamp(1.0 / max(max(share.x, share.y), 1e-6), LEAST, MOST);
+    let zoom = clamp(exp2(round(log2(wanted) * STEPS.x) / STEPS.x), LEAST, MOST);
+    let step = size.x / (STEPS.y * zoom);
+    let at = round((means.xy + middle - vec2(CX, CY)) / step) * step;
+    let ray = normalize(vec3(at / vec2(FX, FY), 1.0));
     // The shortest turn that brings the axis to the ray.
     let bent = ray.xy / (1.0 + ray.z);
     gazes[image] = Gaze(

@@ -194,6 +194,24 @@ fn a_threshold_is_kept_to_but_for_pixels_next_to_it() {
 }
 
 #[test]
+fn roundings_do_not_turn_the_camera() {
+    let shape = Shape::new(3, 53, 64);
+    let (image, seen) = (noise(shape.len(), 1), noise(3 * JOINTS, 3));
+    let mask = masks(shape, 1, 1);
+    let [(_, expected), ..] = run(&image, &mask, &seen, shape, RAMP);
+    let noise = noise(mask.len(), 4);
+    let rounded = |by: f32| -> Vec<f32> {
+        let pairs = mask.iter().zip(&noise);
+        pairs.map(|(value, noise)| value + by * noise).collect()
+    };
+    let [(_, found), ..] = run(&image, &rounded(1e-3), &seen, shape, RAMP);
+    assert_eq!(difference(&found, &expected), Ok(0.0));
+    // Negative control: of another mask it sees something else.
+    let [(_, found), ..] = run(&image, &rounded(1.0), &seen, shape, RAMP);
+    assert!(difference(&found, &expected).unwrap() > 0.1);
+}
+
+#[test]
 fn a_pixel_more_in_the_mask_is_noticed() {
     let shape = Shape::new(3, 20, 24);
     let (image, seen) = (noise(shape.len(), 1), noise(3 * JOINTS, 3));

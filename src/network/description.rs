@@ -114,7 +114,8 @@ impl Overlay {
 }
 
 /// How a network's camera turns to the robot: to the mean of the mask's pixels, zoomed so that so many of their
-/// standard deviations are as wide or as high as the image, whichever is the less zoom.
+/// standard deviations are as wide or as high as the image, whichever is the less zoom; in steps of an eighth of an
+/// octave, and of a 64th of the width that it sees.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Zoom {

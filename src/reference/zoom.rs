@@ -31,9 +31,13 @@ impl Gaze {
     }
 }
 
+/// Steps of a zoom in an octave, and of a direction in the width of what the camera sees: roundings and noise in a mask, which move
+/// its mean by hundredths of a pixel, leave the camera where it is.
+const STEPS: [f32; 2] = [8.0, 64.0];
+
 /// Turns a network's camera to the pixels that the overlay's `rule` shows by `mask` `[1, height, width]`, each as
 /// heavy as it is shown: to their mean, so close that `spread` of their standard deviations are as wide or as high as the
-/// image. Where there are none, it is the canonical `camera`.
+/// image, both in steps: of an eighth of an octave, and of a 64th of the width of what the camera sees. Where there are none, it is the canonical `camera`.
 pub fn zoom(mask: &Tensor, rule: Overlay, camera: &Intrinsics, zoom: Zoom) -> Gaze {
     let Shape { height, width, .. } = mask.shape();
     let size = [width as f32, height as f32];
@@ -58,9 +62,13 @@ pub fn zoom(mask: &Tensor, rule: Overlay, camera: &Intrinsics, zoom: Zoom) -> Ga
         let variance = squares[axis] / weight - mean[axis] * mean[axis];
         zoom.spread * (variance.max(0.0).sqrt() as f32) / size[axis]
     });
-    let wanted: f32 = 1.0 / share[0].max(share[1]).max(1e-6);
-    let x = (mean[0] as f32 + middle[0] - camera.cx as f32) / camera.fx as f32;
-    let y = (mean[1] as f32 + middle[1] - camera.cy as f32) / camera.fy as f32;
+    let within = |value: f32| value.clamp(zoom.least, zoom.most);
+    let wanted = within(1.0 / share[0].max(share[1]).max(1e-6));
+    let nearer = within(((wanted.log2() * STEPS[0]).round_ties_even() / STEPS[0]).exp2());
+    let step = size[0] / (STEPS[1] * nearer);
+    let stepped = |at: f32| (at / step).round_ties_even() * step;
+    let x = stepped(mean[0] as f32 + middle[0] - camera.cx as f32) / camera.fx as f32;
+    let y = stepped(mean[1] as f32 + middle[1] - camera.cy as f32) / camera.fy as f32;
     let length = (x * x + y * y + 1.0).sqrt();
     let [x, y, z] = [x / length, y / length, 1.0 / length];
     // The shortest turn that brings the axis to the ray.
@@ -71,7 +79,7 @@ pub fn zoom(mask: &Tensor, rule: Overlay, camera: &Intrinsics, zoom: Zoom) -> Ga
             [-y * bent_x, 1.0 - y * bent_y, -y],
             [x, y, z],
         ],
-        zoom: wanted.clamp(zoom.least, zoom.most),
+        zoom: nearer,
     }
 }
 

@@ -80,6 +80,18 @@ def test_who_reads_the_cache_keeps_what_was_in_it(recording, tmp_path):
     assert not torch.equal(trained_on.pixels([0])[0], again.pixels([0])[0])
 
 
+def test_only_the_robot_is_relit():
+    torch.manual_seed(4)
+    masks = torch.zeros(200, 1, 8, 8)
+    masks[:, :, 2:5] = 1
+    images = torch.full((200, 3, 8, 8), 0.5)
+    relit = data.relight_robots(images, masks)
+    behind = (1 - masks).bool().expand_as(images)
+    assert torch.equal(relit[behind], images[behind])
+    gain = relit[:, 0, 3, 3] / 0.5
+    assert 0.29 < gain.min() < 0.4 and 1.15 < gain.max() < 1.31
+
+
 def test_a_mask_s_parts_are_those_of_its_picture():
     torch.manual_seed(5)
     # Where the mask is, the picture is bright, whatever becomes of its colours.

@@ -58,7 +58,8 @@ def test_the_camera_looks_at_the_robot_at_a_size_of_its_own():
     assert torch.equal(rotations[2], torch.eye(3)) and zooms[2] == 1
 
 
-def test_what_is_half_shown_weighs_half():
+def test_what_is_half_shown_weighs_half(monkeypatch):
+    monkeypatch.setattr(zoom, "STEPS", (8000, 64000))
     masks = torch.zeros(3, 1, INPUT_HEIGHT, INPUT_WIDTH)
     masks[:, :, 100, 50] = 1
     masks[:, 0, 100, 150] = torch.tensor([0.5, 0.55, 0.0])
@@ -68,6 +69,23 @@ def test_what_is_half_shown_weighs_half():
     assert not torch.allclose(columns[0], columns[1], atol=1)
     shown = overlay(torch.ones(3, 3, INPUT_HEIGHT, INPUT_WIDTH), masks, OVERLAYS["ramp"])[:, :, 100, 150]
     assert torch.allclose(shown[:, 0], torch.tensor([0.5, 0.75, 0.0]))
+
+
+def test_roundings_and_noise_do_not_turn_the_camera():
+    torch.manual_seed(2)
+    masks = torch.zeros(40, 1, INPUT_HEIGHT, INPUT_WIDTH)
+    for mask, x in zip(masks, torch.randint(10, 150, (40,)), strict=True):
+        mask[:, 60:140, x : x + 50] = 0.9
+    noisy = (masks + 0.02 * torch.randn_like(masks)).clamp(0, 1)
+
+    def turned(masks):
+        rotations, zooms = zoom.look_at(masks, zoom.ZOOM, OVERLAYS["ramp"])
+        return torch.cat([rotations[:, 2], zooms[:, None]], 1)
+
+    same = (turned(masks) == turned(noisy)).all(1)
+    assert same.float().mean() > 0.85
+    # Eight pixels to the side are two steps or more.
+    assert (turned(masks) != turned(masks.roll(8, 3))).any(1).all()
 
 
 def test_varied_cameras_still_look_there():
@@ -134,7 +152,8 @@ def test_of_what_is_alike_everywhere_the_closer_mask_is_the_same():
     torch.manual_seed(0)
     images = torch.rand(2, 3, INPUT_HEIGHT, INPUT_WIDTH)
     images[0] = 0.5
-    images[1, :, 60:100, 30:90] += 5
+    images[1] -= 8
+    images[1, :, 60:100, 30:90] += 8
     once, twice = (evaluate.masks_of(_Bright(), images, coarse) for coarse in (None, _Bright()))
     assert torch.allclose(once[0], twice[0], atol=1e-4)
     # Where there is something, it is looked at.

@@ -303,6 +303,8 @@ def _uniform(count, low, high, *shape):
 
 # Share of the samples whose colours, and whose view or mask, vary beyond what the recordings vary already.
 VARIED = 0.35
+# Of what a coarse network learns from: it has to find the robot in any picture, and need not be exact.
+COARSE_VARIED = 0.6
 
 
 def jitter_masks(masks):
@@ -325,10 +327,20 @@ def jitter_colours(images):
     return torch.cat([_jitter_colours(part) for part in parts]).permute(0, 3, 1, 2)
 
 
-def jitter_some_colours(images):
-    """The same of a share VARIED of the images; the others as they are."""
+def relight_robots(images, masks):
+    """Other light on the robot than on what is behind it: against the sky, a window or a lamp, an arm is darker in a photograph than
+    where a renderer lights both.
+
+    From f32 [N, 3, H, W] and [N, 1, H, W], both in [0, 1], to images of the same shape.
+    """
+    gain = torch.exp(_uniform(len(images), math.log(0.3), math.log(1.3), 1, 1, 1))
+    return (images * (1 + masks * (gain - 1))).clamp_(max=1)
+
+
+def jitter_some_colours(images, share=VARIED):
+    """The same of a share of the images; the others as they are."""
     plain = images.permute(0, 3, 1, 2).float() / 255
-    some = torch.rand(len(images)) < VARIED
+    some = torch.rand(len(images)) < share
     if some.any():
         plain[some] = jitter_colours(images[some])
     return plain
@@ -382,12 +394,15 @@ def random_views(images, masks, height, width, tilt_degrees=10, zoom=(0.7, 1.6))
     return both[:, :3], (both[:, 3:] >= 0.5).float()
 
 
-def mixed_views(images, masks, height, width, zoom):
+def mixed_views(images, masks, height, width, zoom, share=VARIED):
     """What a free camera's mask network learns from: parts of height x width of the pictures, uint8 [N, H, W, 3], as they are, mirrored
-    half of the time; of some the colours vary, of some the view. Of all, that would be another task than the one it is judged
+    half of the time; of a share the colours vary, of one the light on the robot, of one the view. Of all, that would be another task than the one it is judged
     by: the pictures have lights, cameras and sizes of their own."""
-    plain = jitter_some_colours(images)
-    moved = torch.rand(len(images)) < VARIED
+    plain = jitter_some_colours(images, share)
+    relit = torch.rand(len(images)) < share
+    if relit.any():
+        plain[relit] = relight_robots(plain[relit], masks[relit])
+    moved = torch.rand(len(images)) < share
     parts, truth = random_crops(plain, masks, height, width)
     mirrored = torch.rand(len(images)) < 0.5
     parts[mirrored], truth[mirrored] = parts[mirrored].flip(3), truth[mirrored].flip(3)

@@ -385,7 +385,8 @@ def train_mask(args):
         images, masks = images.to(args.device), masks.to(args.device)
         if args.camera == "fixed":
             return data.random_crops(data.jitter_some_colours(images), masks, height, width)
-        return data.mixed_views(images, masks, height, width, args.zoom)
+        share = data.COARSE_VARIED if args.coarse else data.VARIED
+        return data.mixed_views(images, masks, height, width, args.zoom, share)
 
     def batch_loss(images, masks):
         return losses.mask_loss(network(images), masks, w_fg, w_bg)

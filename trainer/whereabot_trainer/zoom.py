@@ -14,15 +14,18 @@ from .networks import CAMERA, share
 ZOOM = {"spread": 5.0, "least": 0.5, "most": 4.0}
 # The mask network's: never out, and in no farther than the pictures that it is trained on are enlarged.
 MASK_ZOOM = {"spread": 4.5, "least": 1.0, "most": 2.0}
+# Of the zoom, in an octave; of the direction, in the width of what the camera sees.
+STEPS = (8, 64)
 # What it looks at: the coarse mask, each pixel as heavy as it is probable. A share of it that rose steeply would turn the camera
-# by roundings: a look in 16-bit floats, joints moved by millimetres.
+# by roundings.
 LOOKED_AT = {"rule": "multiply"}
 
 
 def look_at(masks, zoom, rule, camera=CAMERA):
     """(rotations [N, 3, 3], zooms [N]) of the cameras that see what the overlay's `rule` lets through of `masks`
     [N, 1, H, W]: from the canonical camera's frame to theirs, without a roll. Where it lets nothing through, the canonical
-    camera itself."""
+    camera itself. Zooms and directions go in steps: roundings and noise in a mask, which move its mean by hundredths of a pixel,
+    moved joints by centimetres through cameras that followed them."""
     inside = share(masks[:, 0], rule)
     height, width = inside.shape[1:]
     total = inside.sum((1, 2))
@@ -37,7 +40,10 @@ def look_at(masks, zoom, rule, camera=CAMERA):
     y, deviation_y = mean_and_deviation(inside.sum(2), height)
     extent = zoom["spread"] * torch.maximum(deviation_x / width, deviation_y / height)
     zooms = (1 / extent.clamp(min=1e-6)).clamp(zoom["least"], zoom["most"])
-    ray = torch.stack([(x - camera["cx"]) / camera["fx"], (y - camera["cy"]) / camera["fy"], torch.ones_like(x)], 1)
+    zooms = torch.exp2(torch.round(torch.log2(zooms) * STEPS[0]) / STEPS[0]).clamp(zoom["least"], zoom["most"])
+    step = width / (STEPS[1] * zooms)
+    x, y = (torch.round((place - camera[centre]) / step) * step for place, centre in ((x, "cx"), (y, "cy")))
+    ray = torch.stack([x / camera["fx"], y / camera["fy"], torch.ones_like(x)], 1)
     a, b, c = torch.nn.functional.normalize(ray).unbind(1)
     rotations = torch.stack([
         1 - a * a / (1 + c), -a * b / (1 + c), -a,
