@@ -533,6 +533,17 @@ pub(super) fn uniform_buffer(device: &Device, what: &str, values: &[u32]) -> wgp
     buffer
 }
 
+/// A side that is no power of two. Mesa compiles a kernel again for textures whose sides are, and for those of one layer:
+/// that takes a second in all, and a texel or a layer too much takes nothing.
+fn uneven(side: usize) -> usize {
+    if side.is_power_of_two() {
+        // One more than one is a power itself.
+        (side + 1).max(3)
+    } else {
+        side
+    }
+}
+
 /// An array of storage textures of `[columns, rows, layers]`, checked against the adapter's limits.
 fn storage_texture(
     device: &Device,
@@ -541,9 +552,6 @@ fn storage_texture(
 ) -> Result<wgpu::Texture, GpuError> {
     let limits = device.wgpu().limits();
     let side = limits.max_texture_dimension_2d;
-    // Mesa compiles a kernel again for textures of one layer, and for sides that are powers of two:
-    // that takes a second in all, and a texel or a layer too much takes nothing.
-    let uneven = |side: usize| side + usize::from(side.is_power_of_two());
     let (mut width, height, layers) = (uneven(width), uneven(height), layers.max(2));
     if width == height && layers.is_multiple_of(6) {
         // wgpu's GL backend takes it for a cube.
@@ -628,6 +636,14 @@ pub(super) fn staging_buffer(device: &Device, size: u64) -> wgpu::Buffer {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn no_side_of_a_texture_is_a_power_of_two() {
+        for side in 1..5000 {
+            let uneven = uneven(side);
+            assert!(!uneven.is_power_of_two() && (side..side + 3).contains(&uneven));
+        }
+    }
 
     #[test]
     fn packing_is_undone_by_unpacking() {
