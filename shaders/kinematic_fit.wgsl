@@ -1,7 +1,8 @@
-// Moves six joints to where an arm can have them: `reference::kinematic_fit`, in the same steps. A workgroup an image; each of
-// its first nine invocations brings forth a column of the errors' changes, or the errors themselves.
+// Moves six joints to where an arm can have them: `reference::kinematic_fit`, in the same steps. A workgroup an image, in which
+// an invocation works out what a column of the errors' changes, or of the errors themselves, holds of a joint.
 //
-// Functions are called from as few places as can be: drivers write them out at each, and compile that before the first image.
+// Functions are called from as few places as can be, and loops over joints end at a number that no compiler knows: drivers write
+// both out as often as they are run, and compile that before the first image.
 
 override BODIES: u32;
 
@@ -33,6 +34,9 @@ struct Posture {
 const UPPER_ARM = 0u;
 const FOREARM = 1u;
 const WRIST = 2u;
+
+// JOINTS.
+var<private> joints: u32;
 
 // The links of each body, then `across` and `along`, row by row.
 @group(0) @binding(3) var<storage, read> arm: array<f32>;
@@ -118,7 +122,7 @@ fn assume_posture(links: Links) {
         limbs[limb] = level(limbs[limb], axis);
         off -= lengths[limb] * limbs[limb];
     }
-    for (var joint = 0u; joint < JOINTS; joint++) {
+    for (var joint = 0u; joint < joints; joint++) {
         off += seen[joint];
     }
     posture = Posture(off / f32(JOINTS), axis, limbs);
@@ -154,27 +158,26 @@ fn change(place: vec3<f32>, links: Links, freedom: u32, joint: u32) -> vec4<f32>
     return vec4(mean_depth / depth * (moved - nearer * place), nearer);
 }
 
-fn bring_forth(column: u32, links: Links) {
-    for (var joint = 0u; joint < JOINTS; joint++) {
-        let place = places[joint];
-        if column == FREEDOMS {
-            plain[column][joint] = error(place, joint);
-        } else {
-            plain[column][joint] = change(place, links, column, joint);
-        }
+// What a column holds of a joint: how its error changes, or the error itself.
+fn entry_of(column: u32, joint: u32, links: Links) -> vec4<f32> {
+    let place = places[joint];
+    if column == FREEDOMS {
+        return error(place, joint);
     }
-    for (var i = 0u; i < JOINTS; i++) {
-        var sum = vec4(0.0);
-        for (var j = 0u; j < JOINTS; j++) {
-            sum += weight(i, j) * plain[column][j];
-        }
-        columns[column][i] = sum;
+    return change(place, links, column, joint);
+}
+
+fn whitened(column: u32, i: u32) -> vec4<f32> {
+    var sum = vec4(0.0);
+    for (var j = 0u; j < joints; j++) {
+        sum += weight(i, j) * plain[column][j];
     }
+    return sum;
 }
 
 fn product(a: u32, b: u32) -> f32 {
     var sum = 0.0;
-    for (var joint = 0u; joint < JOINTS; joint++) {
+    for (var joint = 0u; joint < joints; joint++) {
         sum += dot(columns[a][joint], columns[b][joint]);
     }
     return sum;
@@ -221,13 +224,17 @@ fn main(
     @builtin(local_invocation_index) lane: u32,
 ) {
     let image = group.y * groups.x + group.x;
+    joints = JOINTS * groups.z;
     if image >= BATCH {
         return;
     }
+    if lane < JOINTS {
+        seen[lane] = vec3(value(image, 3u * lane), value(image, 3u * lane + 1u), value(image, 3u * lane + 2u));
+    }
+    workgroupBarrier();
     if lane == 0u {
         var sum = vec3(0.0);
-        for (var joint = 0u; joint < JOINTS; joint++) {
-            seen[joint] = vec3(value(image, 3u * joint), value(image, 3u * joint + 1u), value(image, 3u * joint + 2u));
+        for (var joint = 0u; joint < joints; joint++) {
             sum += seen[joint];
         }
         sight = direction(sum);
@@ -236,7 +243,7 @@ fn main(
     // Joints that are not numbers, or not in front of the camera, stay as they are.
     var possible = true;
     var depths = 0.0;
-    for (var joint = 0u; joint < JOINTS; joint++) {
+    for (var joint = 0u; joint < joints; joint++) {
         let depth = dot(seen[joint], sight);
         possible &= depth >= NEAREST && depth <= 1e6;
         depths += depth;
@@ -260,8 +267,14 @@ fn main(
                 places[lane] = joint_of(links, lane);
             }
             workgroupBarrier();
-            if lane < COLUMNS {
-                bring_forth(lane, links);
+            let column = lane / JOINTS;
+            let joint = lane % JOINTS;
+            if column < COLUMNS {
+                plain[column][joint] = entry_of(column, joint, links);
+            }
+            workgroupBarrier();
+            if column < COLUMNS {
+                columns[column][joint] = whitened(column, joint);
             }
             workgroupBarrier();
             for (var entry = lane; entry < COLUMNS * COLUMNS; entry += 64u) {
@@ -285,16 +298,14 @@ fn main(
         }
     }
     workgroupBarrier();
-    if lane == 0u {
-        for (var block = 0u; 4u * block < 3u * JOINTS; block++) {
-            var texel = vec4(0.0);
-            for (var part = 0u; part < 4u; part++) {
-                let channel = 4u * block + part;
-                if channel < 3u * JOINTS {
-                    texel[part] = best[channel / 3u][channel % 3u];
-                }
+    if 4u * lane < 3u * JOINTS {
+        var texel = vec4(0.0);
+        for (var part = 0u; part < 4u; part++) {
+            let channel = 4u * lane + part;
+            if channel < 3u * JOINTS {
+                texel[part] = best[channel / 3u][channel % 3u];
             }
-            output_set(block * BATCH + image, 0u, 0u, texel);
         }
+        output_set(lane * BATCH + image, 0u, 0u, texel);
     }
 }
