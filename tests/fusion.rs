@@ -26,6 +26,7 @@ fn observation(
         px: [0.0, 0.0],
     };
     Observation {
+        file: None,
         camera,
         frame: 0,
         acquired: UNIX_EPOCH + Duration::from_millis(1_000_000 + milliseconds) - back,

@@ -79,6 +79,7 @@ fn observation(camera: usize, frame: u64) -> Observation {
     let ramp = (0..16 * 12).map(|at| (at % 16) as f32 / 15.0);
     let acquired_at = Instant::now();
     Observation {
+        file: None,
         camera,
         frame,
         acquired: at(100 * frame + camera as u64),

@@ -44,6 +44,7 @@ fn observation(camera: usize, frame: u64) -> Observation {
     let now = Instant::now();
     let grey = (frame % 256) as u8;
     Observation {
+        file: None,
         camera,
         frame,
         acquired: SystemTime::now(),

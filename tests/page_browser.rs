@@ -169,6 +169,7 @@ fn observed(camera: usize, name: &str, truth: &Value) -> Observation {
     });
     let joints: Vec<_> = joints.collect();
     Observation {
+        file: None,
         camera,
         frame: 0,
         acquired: SystemTime::now(),

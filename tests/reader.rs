@@ -505,5 +505,11 @@ mod check {
             Some(0)
         );
         assert_eq!(fs::read(&sheet).unwrap(), bytes);
+
+        // Before anything is checked.
+        let output = run(&[".", "--sheet", "nowhere/sheet"], &folder);
+        assert_eq!(output.status.code(), Some(1));
+        assert!(output.stdout.is_empty());
+        assert!(text(&output.stderr).contains("nowhere: no such folder"));
     }
 }

@@ -771,6 +771,11 @@ fn errors_say_where_and_what() {
 
     let action = |rest: &str| format!("{RULE}[[action]]\nname = \"do\"\non = [\"stop\"]\n{rest}");
     check(
+        "[[action]]\nname = \"do\"\non = [\"stop\"]\ncommand = [\"x\"]\n".into(),
+        "\"do\"",
+        "action: expected a [[warning]] that it acts on, found none",
+    );
+    check(
         action(""),
         "\"do\"",
         "action: expected one of command, post, dashboard, found none",
@@ -914,6 +919,7 @@ impl Running {
     fn see(&mut self, distance_m: f64) {
         let now = Instant::now();
         self.warnings.observation(&Observation {
+            file: None,
             camera: 0,
             frame: self.frame,
             acquired: SystemTime::now(),

@@ -206,12 +206,7 @@ fn ensure_new(file: &Path) -> anyhow::Result<()> {
         "{}: exists already, and is not overwritten",
         file.display()
     );
-    let folder = match file.parent() {
-        Some(folder) if folder != Path::new("") => folder,
-        _ => Path::new("."),
-    };
-    ensure!(folder.is_dir(), "{}: no such folder", folder.display());
-    Ok(())
+    super::ensure_folder_of(file)
 }
 
 fn measure(args: &Args) -> anyhow::Result<Report> {

@@ -15,8 +15,10 @@ mod watch;
 mod weights;
 
 use std::io::{self, Write};
+use std::path::Path;
 use std::process::ExitCode;
 
+use anyhow::ensure;
 use clap::error::ErrorKind;
 use clap::{CommandFactory, Parser};
 
@@ -68,6 +70,16 @@ pub fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     })
+}
+
+/// Before long work whose result goes into `file`: there is a folder for it.
+fn ensure_folder_of(file: &Path) -> anyhow::Result<()> {
+    let folder = match file.parent() {
+        Some(folder) if folder != Path::new("") => folder,
+        _ => Path::new("."),
+    };
+    ensure!(folder.is_dir(), "{}: no such folder", folder.display());
+    Ok(())
 }
 
 /// Writes to stdout; whether somebody reads it. A reader that left, such as `head`, has what it wanted: nothing fails for that, and

@@ -55,6 +55,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     {
         bail!("{}: exists; --force overwrites it", sheet.display());
     }
+    if let Some(sheet) = &args.sheet {
+        super::ensure_folder_of(sheet)?;
+    }
     let opened: Vec<_> = args
         .folders
         .iter()

@@ -1,3 +1,4 @@
+use std::path::Path;
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
@@ -16,6 +17,8 @@ pub struct Frame {
     pub acquired: SystemTime,
     /// The same by the monotonic clock.
     pub acquired_at: Instant,
+    /// The file that it is all of, where its source is a folder of images.
+    pub file: Option<Arc<Path>>,
     /// The frame, upright, of `view`'s size.
     pub image: Arc<RgbaImage>,
     /// The camera of that image.

@@ -1,4 +1,6 @@
+use std::borrow::Cow;
 use std::io::{self, Write};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -66,6 +68,8 @@ enum Content<'a> {
         camera: &'a str,
         robot: &'a str,
         frame_number: u64,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        file: Option<Cow<'a, str>>,
         acquired_s: f64,
         age_ms: f64,
         #[serde(flatten)]
@@ -227,6 +231,7 @@ impl Sink for Lines {
                 camera: self.name(observation.camera),
                 robot: robot.map_or("", |named| &named.robot),
                 frame_number: observation.frame,
+                file: observation.file.as_deref().map(Path::to_string_lossy),
                 acquired_s: seconds(observation.acquired),
                 age_ms: milliseconds(observation.age()),
                 estimate: EstimateLine::from(&observation.estimate),

@@ -1,3 +1,4 @@
+use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -21,6 +22,8 @@ pub struct Observation {
     pub acquired_at: Instant,
     /// When the answer was there.
     pub answered_at: Instant,
+    /// The file that the frame is all of, where its source is a folder of images.
+    pub file: Option<Arc<Path>>,
     /// The frame as it was searched: upright, of `view`'s size.
     pub image: Arc<RgbaImage>,
     /// The camera of that image.

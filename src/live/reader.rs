@@ -133,6 +133,7 @@ impl Reader {
             number,
             acquired: shot.acquired,
             acquired_at: shot.acquired_at,
+            file: shot.file,
             image,
             view: oriented(camera, orientation),
         }))

@@ -249,6 +249,7 @@ impl Scheduler {
                 acquired: frame.acquired,
                 acquired_at: frame.acquired_at,
                 answered_at,
+                file: frame.file,
                 image: frame.image,
                 view: frame.view,
                 estimate,

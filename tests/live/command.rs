@@ -46,6 +46,11 @@ fn lines_say_what_was_found_and_when() {
     assert_eq!((of("live", "event"), of("ended", "event")), (1, 1));
     let last = program.seen.iter().rfind(|line| line["type"] == "result");
     assert_eq!(last.unwrap()["frame_number"], 29);
+    for line in program.seen.iter().filter(|l| l["type"] == "result") {
+        let name = format!("{:03}.png", line["frame_number"].as_u64().unwrap());
+        let file = line["file"].as_str().unwrap();
+        assert!(file.ends_with(&name), "{file}: expected {name}");
+    }
 }
 
 #[test]

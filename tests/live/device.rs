@@ -176,6 +176,7 @@ fn an_engine_says_what_is_lost_with_its_device() {
     let frame = Frame {
         camera: 0,
         number: 0,
+        file: None,
         acquired: SystemTime::now(),
         acquired_at: Instant::now(),
         view: Camera::from_hfov(64, 48, 1.2),

@@ -594,6 +594,7 @@ mod tests {
 
     fn observation(frame: u64) -> Observation {
         Observation {
+            file: None,
             camera: 0,
             frame,
             acquired: SystemTime::now(),

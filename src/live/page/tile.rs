@@ -120,6 +120,7 @@ mod tests {
         let canonical = resized(&camera, 128, 72);
         let probability = (0..128 * 72).map(|i| f32::from(u8::from(i % 128 < 64)));
         let observation = Observation {
+            file: None,
             camera: 0,
             frame: 0,
             acquired: SystemTime::now(),

@@ -21,7 +21,7 @@ const LATE: Duration = Duration::from_secs(10);
 const ANNOUNCED: usize = 64;
 
 /// A frame that ffmpeg's filter `showinfo` announced: its pixels are about to come.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub(super) struct Announced {
     pub shot: Shot,
     /// Columns and rows.

@@ -46,7 +46,10 @@ impl Stream for Pictures {
         if !self.pace.wait() {
             return Ok(None);
         }
-        let shot = Shot::now();
+        let shot = Shot {
+            file: Some(path.as_path().into()),
+            ..Shot::now()
+        };
         let read = image_file::read_upright(path).map_err(|cause| {
             let text = format!("{}: {cause}", path.display());
             SourceError::Frame(text)

@@ -9,6 +9,7 @@ mod pace;
 mod recording;
 mod showinfo;
 
+use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
@@ -40,7 +41,7 @@ pub trait Stream {
 }
 
 /// What there is to know about a frame besides its pixels.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Shot {
     /// When it was taken, by the wall clock.
     pub acquired: SystemTime,
@@ -48,6 +49,8 @@ pub struct Shot {
     pub acquired_at: Instant,
     /// Its camera, where the source knows: of the image's size.
     pub camera: Option<Camera>,
+    /// The file that it is all of, where it is.
+    pub file: Option<Arc<Path>>,
 }
 
 impl Shot {
@@ -57,6 +60,7 @@ impl Shot {
             acquired: SystemTime::now(),
             acquired_at: Instant::now(),
             camera: None,
+            file: None,
         }
     }
 

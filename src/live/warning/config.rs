@@ -307,6 +307,15 @@ impl Config {
             self.actions.iter().map(|action| &action.name),
         )?;
         for action in &self.actions {
+            if self.rules.is_empty() {
+                let expected = "a [[warning]] that it acts on";
+                return Err(ConfigError::new(
+                    action.name.span(),
+                    "action",
+                    expected,
+                    "none",
+                ));
+            }
             action.check(&self.rules)?;
         }
         Ok(())
