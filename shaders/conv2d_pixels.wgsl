@@ -1,7 +1,7 @@
 // Every pixel of a convolution, behind `conv2d_rows`.
 
 fn convolve(workgroup: u32, local: u32, lane: u32) {
-    let part = part_of(workgroup);
+    let part = part_of(workgroup, layer.row_groups * layer.width);
     let position = part.first + local;
     let pixel = first_pixel(position);
     let sums = sums_at(pixel, part.image, part.pair, lane);

@@ -14,9 +14,9 @@ fn greatest(own: vec4<f32>) -> vec4<f32> {
 }
 
 fn convolve(workgroup: u32, local: u32, lane: u32) {
-    let part = part_of(workgroup);
-    let position = part.first + local;
     let columns = layer.width * SIZE;
+    let part = part_of(workgroup, layer.row_groups * columns);
+    let position = part.first + local;
     let row_group = quotient(position, columns);
     let column = position - row_group * columns;
     let sums = sums_at(vec2(column, row_group * ROWS), part.image, part.pair, lane);

@@ -17,11 +17,14 @@ struct Part {
     first: u32,
 }
 
-fn part_of(workgroup: u32) -> Part {
+// Image after image, of so many positions each: the rows that neighbours share stay in a CPU's caches. Behind the last image
+// there may be workgroups that a long dispatch has too many.
+fn part_of(workgroup: u32, positions: u32) -> Part {
     let pairs = (layer.out_blocks + 1u) / 2u;
     let pixels = quotient(workgroup, pairs);
-    let part = quotient(pixels, layer.batch);
-    return Part(workgroup - pixels * pairs, pixels - part * layer.batch, part * 64u);
+    let parts = (positions + 63u) / 64u;
+    let image = quotient(pixels, parts);
+    return Part(workgroup - pixels * pairs, image, (pixels - image * parts) * 64u);
 }
 
 fn sums_at(pixel: vec2<u32>, image: u32, pair: u32, lane: u32) -> Sums {
@@ -74,6 +77,9 @@ fn sums_at(pixel: vec2<u32>, image: u32, pair: u32, lane: u32) -> Sums {
 
 // Stores a pixel's four channels of each block.
 fn store(at: vec2<u32>, image: u32, pair: u32, low: vec4<f32>, high: vec4<f32>) {
+    if image >= layer.batch {
+        return;
+    }
     let plane = 2u * pair * layer.batch + image;
     textureStore(output, at + layer.out_margin, plane, activate(low));
     if 2u * pair + 1u < layer.out_blocks {

@@ -12,8 +12,9 @@ fn main(
 ) {
     let workgroup = group.y * groups.x + group.x;
     let batch = layer.batch;
-    let image = workgroup % batch;
-    let position = workgroup / batch * 64u + local;
+    let parts = (layer.row_groups * layer.width + 63u) / 64u;
+    let image = workgroup / parts;
+    let position = workgroup % parts * 64u + local;
     let pixel = first_pixel(position);
     let centre = vec2<i32>(pixel + layer.in_margin);
 
@@ -37,7 +38,7 @@ fn main(
     }
     for (var row = 0u; row < ROWS; row++) {
         let y = pixel.y + row * layer.lattice;
-        if position < layer.row_groups * layer.width && y < layer.height {
+        if image < batch && position < layer.row_groups * layer.width && y < layer.height {
             let sum = dot(sums[row], vec4(1.0)) + bias[0].x;
             let at = vec2(pixel.x, y) + layer.out_margin;
             textureStore(output, at, image, activate(vec4(sum, 0.0, 0.0, 0.0)));
