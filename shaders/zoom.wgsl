@@ -1,6 +1,7 @@
 // Turns a network's camera to what the overlay shows of each image and zooms in on it: to the mean of the pixels,
 // each as heavy as it is shown, so close that SPREAD of their standard deviations are as wide or as high as the image, both
-// in steps, which roundings and noise do not take. A workgroup an image, which adds up every GROUPth pixel in each invocation: always in the same order.
+// in steps, which roundings and noise do not take. A workgroup an image, which adds up every GROUPth pixel in each
+// invocation: always in the same order.
 
 override SPREAD: f32;
 override LEAST: f32;

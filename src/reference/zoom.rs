@@ -37,7 +37,8 @@ const STEPS: [f32; 2] = [8.0, 64.0];
 
 /// Turns a network's camera to the pixels that the overlay's `rule` shows by `mask` `[1, height, width]`, each as
 /// heavy as it is shown: to their mean, so close that `spread` of their standard deviations are as wide or as high as the
-/// image, both in steps: of an eighth of an octave, and of a 64th of the width of what the camera sees. Where there are none, it is the canonical `camera`.
+/// image, both in steps: of an eighth of an octave, and of a 64th of the width of what the camera sees. Where there are
+/// none, it is the canonical `camera`.
 pub fn zoom(mask: &Tensor, rule: Overlay, camera: &Intrinsics, zoom: Zoom) -> Gaze {
     let Shape { height, width, .. } = mask.shape();
     let size = [width as f32, height as f32];
