@@ -77,7 +77,7 @@ pub fn narrow_device(workgroups: u32) -> Device {
     Device::from_host(device, queue).unwrap()
 }
 
-/// A driver that `scripts/drivers` runs tests on, each with differences that `tests/drivers.rs` expects.
+/// A driver that `scripts/drivers` runs tests on, each with differences that `tests/engine/drivers.rs` expects.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Driver {
     /// Mesa's Vulkan on the CPU.
