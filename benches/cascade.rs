@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use image::RgbaImage;
-use whereabot::camera::{Camera, Rectification};
+use whereabot::camera::{Camera, Gaze, Rectification};
 use whereabot::cascade::{Locator, Output};
 use whereabot::gpu::{AdapterRequest, Device, Plan, Precision};
 use whereabot::network::Model;
@@ -57,7 +57,15 @@ fn cascade(criterion: &mut Criterion) {
     let rectification = Rectification::new(&camera, to, input.width, input.height);
     let (rows, columns) = (input.height as usize, input.width as usize);
     group.bench_function("rectify, reference", |b| {
-        b.iter(|| reference::rectify(black_box(&image), &rectification, rows, columns));
+        b.iter(|| {
+            reference::rectify(
+                black_box(&image),
+                &rectification,
+                &Gaze::CANONICAL,
+                rows,
+                columns,
+            )
+        });
     });
     let mut plan = Plan::new(&device, &model, 1, Precision::F32).unwrap();
     plan.write(&device, 0, &image, &rectification).unwrap();

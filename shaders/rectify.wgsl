@@ -1,4 +1,5 @@
-// Undistorts and resamples a camera's image into the canonical pinhole camera of the networks.
+// Undistorts and resamples a camera's image into the canonical pinhole camera of the networks, or into one that is turned and
+// zoomed in (`gaze.wgsl`, which stands in front).
 //
 // An output pixel is the mean of a grid of bilinear samples over its footprint in the source, as
 // many as the footprint has pixels: nothing is skipped when the image shrinks. What the source does
@@ -34,6 +35,9 @@ struct Rectification {
 // keeps them all.
 @group(0) @binding(4) var<storage, read> stored: Rectification;
 
+// [image]: what sees each.
+@group(0) @binding(6) var<storage, read> gazes: array<Gaze>;
+
 // Where a ray at z = 1 lands in the source, in pixels.
 fn project(params: Rectification, ray: vec2<f32>) -> vec2<f32> {
     let r2 = dot(ray, ray);
@@ -60,9 +64,19 @@ fn project(params: Rectification, ray: vec2<f32>) -> vec2<f32> {
     return bent * params.source.xy + params.source.zw;
 }
 
-fn ray_of(params: Rectification, pixel: vec2<f32>) -> vec2<f32> {
-    return (pixel - params.canonical.zw) * params.canonical.xy;
+// Where a pixel looks, in the canonical camera's frame.
+fn ray_of(params: Rectification, gaze: Gaze, pixel: vec2<f32>) -> vec3<f32> {
+    let seen = (pixel - params.canonical.zw) * params.canonical.xy / gaze.right.w;
+    return turned_back(gaze, vec3(seen, 1.0));
 }
+
+// At z = 1, for what is ahead.
+fn at_one(ray: vec3<f32>) -> vec2<f32> {
+    return ray.xy / max(ray.z, AHEAD);
+}
+
+// What is less far ahead is beside the camera or behind it.
+const AHEAD = 1e-3;
 
 // Bilinear, as if black pixels lay round the source: without a step at its border. What lies beyond it may be
 // read, but weighs nothing.
@@ -93,16 +107,18 @@ fn main(
     }
     // Read once: a CPU rasteriser takes as long for one of these numbers as for three texels.
     let params = stored;
+    let gaze = gazes[params.index];
     let place = output_place(index);
     let pixel = vec2(f32(place.x), f32(place.y));
     var colour = vec3(0.0);
-    let ray = ray_of(params, pixel);
-    if dot(ray, ray) <= params.max_radius * params.max_radius {
-        let centre = project(params, ray);
-        let right = project(params, ray_of(params, pixel + vec2(0.5, 0.0)));
-        let left = project(params, ray_of(params, pixel - vec2(0.5, 0.0)));
-        let lower = project(params, ray_of(params, pixel + vec2(0.0, 0.5)));
-        let upper = project(params, ray_of(params, pixel - vec2(0.0, 0.5)));
+    let ray = ray_of(params, gaze, pixel);
+    let middle = at_one(ray);
+    if ray.z > AHEAD && dot(middle, middle) <= params.max_radius * params.max_radius {
+        let centre = project(params, middle);
+        let right = project(params, at_one(ray_of(params, gaze, pixel + vec2(0.5, 0.0))));
+        let left = project(params, at_one(ray_of(params, gaze, pixel - vec2(0.5, 0.0))));
+        let lower = project(params, at_one(ray_of(params, gaze, pixel + vec2(0.0, 0.5))));
+        let upper = project(params, at_one(ray_of(params, gaze, pixel - vec2(0.0, 0.5))));
         let along_x = right - left;
         let along_y = lower - upper;
         let step = 1.0 / vec2<f32>(params.samples);

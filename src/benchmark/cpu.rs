@@ -7,7 +7,7 @@ use super::{
     BenchmarkError, CascadeFigures, IMAGE, LayerFigures, LayerWork, Options, Progress, Report,
     Timing, Weights, rectification, source,
 };
-use crate::camera::Rectification;
+use crate::camera::{Gaze, Rectification};
 use crate::cascade::LocateError;
 use crate::gpu::{Precision, Work};
 use crate::network::{Model, Network, Node, Shape, Source};
@@ -127,7 +127,9 @@ fn layer_times(
         last = now;
     };
     let shape = model.mask_network.input();
-    let image = reference::rectify(image, rectification, shape.height, shape.width);
+    let rectified =
+        |gaze: &Gaze| reference::rectify(image, rectification, gaze, shape.height, shape.width);
+    let image = rectified(&Gaze::CANONICAL);
     lap();
     let description = &model.description;
     let run = |network, image: &reference::Tensor, lap: &mut dyn FnMut()| {
@@ -142,7 +144,9 @@ fn layer_times(
             let coarse = run(network, &image, &mut lap);
             let coarse = coarse.ok_or(LocateError::Shape("coarse network"))?;
             let camera = &description.camera;
-            let (seen, gaze) = reference::mask_input(&image, &coarse, camera, zoom);
+            let gaze = reference::mask_gaze(&coarse, camera, zoom);
+            lap();
+            let seen = rectified(&gaze);
             lap();
             let closer = masked(&seen, &mut lap)?;
             let mask = reference::zoom_mask(&closer, &coarse, camera, &gaze);
@@ -183,10 +187,12 @@ fn layer_works(model: &Model, batch: usize) -> Vec<LayerWork> {
     };
     // Pixels have four bytes, as values have.
     let pixels = IMAGE.0 as usize * IMAGE.1 as usize;
-    let mut layers = vec![between("rectify", pixels + image.len())];
+    let rectify = |name| between(name, pixels + image.len());
+    let mut layers = vec![rectify("rectify")];
     if let Some(network) = &model.coarse_network {
         layers.extend(network_works("coarse", network, batch));
-        layers.push(between("coarse.zoom_image", 2 * image.len() + mask.len()));
+        layers.push(between("coarse.zoom", mask.len()));
+        layers.push(rectify("coarse.rectify"));
     }
     layers.extend(network_works("mask", &model.mask_network, batch));
     if model.coarse_network.is_some() {

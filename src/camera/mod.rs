@@ -5,6 +5,7 @@
 
 mod calibration;
 mod camera_info;
+mod gaze;
 pub mod graphics;
 mod intrinsics;
 mod lens;
@@ -13,6 +14,7 @@ mod rectification;
 mod unrectification;
 
 pub use calibration::{Camera, CameraError};
+pub use gaze::Gaze;
 pub use image::metadata::Orientation;
 pub use intrinsics::Intrinsics;
 pub use lens::{Distortion, Lens};

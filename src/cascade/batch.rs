@@ -157,16 +157,16 @@ impl BatchLocator {
             self.idle.push(slot);
             return Err(error);
         }
-        let sources = images.iter().filter_map(|image| {
-            let place = self.cameras.get(image.place);
-            place.and_then(|place| place.source.step())
-        });
+        let places = images
+            .iter()
+            .filter_map(|image| self.cameras.get(image.place));
+        let sources = places.map(|place| &place.source);
         let mut encoder = self
             .device
             .wgpu()
             .create_command_encoder(&Default::default());
         self.plan
-            .dispatch(&mut encoder, sources.chain(self.plan.steps(true)), None);
+            .dispatch(&mut encoder, self.plan.steps_of(sources, true), None);
         self.plan.copy_results(&mut encoder, &slot.results);
         if let Some(masks) = &slot.masks {
             self.plan.copy_masks(&mut encoder, masks);

@@ -6,9 +6,9 @@ use super::Estimate;
 #[cfg(not(target_arch = "wasm32"))]
 use super::Mask;
 use super::view::View;
-use crate::camera::{Camera, CameraError, Crop, Rectification, Texels};
+use crate::camera::{Camera, CameraError, Crop, Gaze, Rectification, Texels};
 use crate::gpu::{Device, Frame, GpuError, Plan, Precision};
-use crate::network::{Description, Model};
+use crate::network::{Description, Model, Shape};
 use crate::reference;
 
 /// Finds the robot of one model in images.
@@ -216,7 +216,7 @@ impl Locator {
             }
             Engine::Cpu { model } => {
                 let shape = model.mask_network.output();
-                let image = reference::rectify(image, &rectification, shape.height, shape.width);
+                let image = rectified(image, &rectification, shape, &Gaze::CANONICAL);
                 let mask = reference::Tensor::new(shape, mask.probability.clone())
                     .ok_or(LocateError::Shape("mask network"))?;
                 reference::joints(model, &image, &mask)
@@ -236,6 +236,15 @@ impl Locator {
     }
 }
 
+fn rectified(
+    image: &RgbaImage,
+    rectification: &Rectification,
+    shape: Shape,
+    gaze: &Gaze,
+) -> reference::Tensor {
+    reference::rectify(image, rectification, gaze, shape.height, shape.width)
+}
+
 fn run_reference(
     model: &Model,
     image: &RgbaImage,
@@ -244,8 +253,10 @@ fn run_reference(
 ) -> Result<Frame, LocateError> {
     let description = &model.description;
     let shape = model.mask_network.input();
-    let image = reference::rectify(image, rectification, shape.height, shape.width);
-    let mask = reference::mask(model, &image).ok_or(LocateError::Shape("mask network"))?;
+    let rectified = |gaze: &Gaze| rectified(image, rectification, shape, gaze);
+    let image = rectified(&Gaze::CANONICAL);
+    let mask = reference::mask(model, &image, rectified);
+    let mask = mask.ok_or(LocateError::Shape("mask network"))?;
     let presence = description.presence;
     let coverage = reference::coverage(&mask, presence.mask_threshold, presence.sure_threshold);
     let joints = if output.mask_only {

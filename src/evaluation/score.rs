@@ -1,7 +1,7 @@
 use image::{GrayImage, Rgba, RgbaImage};
 
 use super::{EvaluationError, MaskCounts, NotFinite, distances_cm, distances_px};
-use crate::camera::{Camera, Rectification};
+use crate::camera::{Camera, Gaze, Rectification};
 use crate::cascade::{Locator, Mask, Output, Status};
 use crate::network::Description;
 use crate::reference;
@@ -146,7 +146,7 @@ pub fn network_mask(mask: &GrayImage, camera: &Camera, description: &Description
         Rgba([value, value, value, 255])
     });
     let (width, height) = (input.width as usize, input.height as usize);
-    let seen = reference::rectify(&colour, &rectification, height, width);
+    let seen = reference::rectify(&colour, &rectification, &Gaze::CANONICAL, height, width);
     let red = seen.data().iter().take(width * height);
     Mask {
         width: input.width,

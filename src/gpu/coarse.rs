@@ -11,12 +11,12 @@ use crate::network::{Network, Overlay, Zoom};
 pub(super) struct Coarse {
     network: NetworkPlan,
     gazes: Gazes,
-    /// From the coarse mask to the mask network's input.
-    look: [Step; 2],
+    /// From the coarse mask to the cameras.
+    look: Step,
 }
 
 impl Coarse {
-    /// From `image` by `network` to `input`, the mask network's, each pixel of the coarse mask as heavy as it is probable: a
+    /// From `image` by `network` to where the mask network looks, each pixel of the coarse mask as heavy as it is probable: a
     /// share of it that rose steeply would turn the camera by roundings. `planned` is told of each layer. Driver errors reach the
     /// caller's [`Device::scoped`].
     ///
@@ -25,20 +25,14 @@ impl Coarse {
     pub fn new(
         device: &Device,
         (network, zoom): (&Network, Zoom),
-        (image, input): (&Tensor, &Tensor),
+        image: &Tensor,
         canonical: Intrinsics,
         planned: &mut dyn FnMut(),
     ) -> Result<Self, GpuError> {
         let network = NetworkPlan::planned(device, "coarse", network, image, None, planned)?;
         let gazes = Gazes::new(device, canonical, image.batch)?;
-        let look = [
-            gazes.zoom(device, network.output(), zoom, Overlay::Multiply {})?,
-            gazes.zoom_image(device, image, input)?,
-        ];
-        let look = look.map(|step| {
-            let label = format!("coarse.{}", step.label());
-            step.labelled(label)
-        });
+        let look = gazes.zoom(device, network.output(), zoom, Overlay::Multiply {})?;
+        let look = look.labelled("coarse.zoom".to_owned());
         Ok(Self {
             network,
             gazes,
@@ -46,9 +40,14 @@ impl Coarse {
         })
     }
 
-    /// The dispatches in front of the mask network's, in order.
+    /// The dispatches from the canonical cameras' images to where the mask network looks, in order.
     pub fn steps(&self) -> impl Iterator<Item = &Step> {
-        self.network.steps().iter().chain(&self.look)
+        self.network.steps().iter().chain([&self.look])
+    }
+
+    /// Where it looks.
+    pub fn gazes(&self) -> &Gazes {
+        &self.gazes
     }
 
     /// The canonical camera's mask, and the dispatch that makes it of what the mask network says is `closer`.

@@ -54,7 +54,7 @@ pub use outputs::Outputs;
 pub use overlay::overlay;
 pub use plan::{Frame, Plan};
 pub use probe::{ArithmeticProbe, copy_probe};
-pub use rectify::Rectify;
+pub use rectify::{Rectify, Sight};
 pub use source::{Planes, Yuv};
 pub use step::{Step, Work};
 pub use tensor::Tensor;

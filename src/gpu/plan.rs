@@ -4,21 +4,24 @@ use super::coarse::{Coarse, Merged};
 use super::coverage::{Totals, coverage};
 use super::kinematic_fit::kinematic_fit;
 use super::overlay::overlay;
-use super::rectify::Rectify;
+use super::rectify::{Rectify, Sight};
 use super::source::Planes;
 use super::step::Step;
 use super::tensor::{Tensor, staging_buffer, storage_buffer};
 use super::zoom::Gazes;
 use super::{Device, GpuError, NetworkPlan, Precision};
 use crate::camera::Rectification;
-use crate::network::{Coverage, Model};
+use crate::network::{Coverage, Model, Shape};
 
 /// The whole cascade planned for a batch of images: rectify, coarse network, mask network, overlay, joint network,
 /// coverage. Everything is allocated, compiled and bound once; a frame is one submission and one
 /// small readback.
 #[derive(Debug)]
 pub struct Plan {
-    image: Tensor,
+    /// What sees the pictures: the canonical cameras and, behind a coarse network, the mask network's.
+    sights: Vec<Sight>,
+    /// Of the canonical image.
+    shape: Shape,
     rectify: Vec<Rectify>,
     coarse: Option<Coarse>,
     mask: NetworkPlan,
@@ -94,17 +97,27 @@ impl Plan {
         device.scoped(|| {
             let input = |what, network| NetworkPlan::input(device, layout, what, network, batch);
             let camera = description.camera;
+            let canonical = Gazes::new(device, camera, batch)?;
             let seen = input("image", &model.mask_network)?;
             let (image, coarse) = match model.coarse() {
                 None => (seen.clone(), None),
-                Some((network, zoom)) => {
-                    let image = input("coarse image", network)?;
-                    let tensors = (&image, &seen);
-                    let coarse =
-                        Coarse::new(device, (network, zoom), tensors, camera, &mut planned)?;
+                Some(network) => {
+                    let image = input("coarse image", network.0)?;
+                    let coarse = Coarse::new(device, network, &image, camera, &mut planned)?;
                     (image, Some(coarse))
                 }
             };
+            let sight = |label, gazes: &Gazes, image: &Tensor| Sight {
+                label,
+                gazes: gazes.clone(),
+                image: image.clone(),
+            };
+            let mut sights = vec![sight("rectify", &canonical, &image)];
+            sights.extend(
+                coarse
+                    .as_ref()
+                    .map(|c| sight("coarse.rectify", c.gazes(), &seen)),
+            );
             let rectify = (0..batch).map(|_| Rectify::new(device)).collect();
             let mask = NetworkPlan::planned(
                 device,
@@ -162,7 +175,8 @@ impl Plan {
             let results = staging_buffer(device, results);
             let masks = staging_buffer(device, output.staging_size());
             Ok(Self {
-                image,
+                sights,
+                shape: image.shape,
                 rectify,
                 coverage,
                 totals,
@@ -192,7 +206,7 @@ impl Plan {
         rectification: &Rectification,
     ) -> Result<(), GpuError> {
         let (slot, params) = slot(&mut self.rectify, index, rectification)?;
-        slot.write(device, &self.image, source, &params)
+        slot.write(device, &self.sights, source, &params)
     }
 
     /// Gives image `index` of the frames from the next one on: `planes`, and how they become the canonical
@@ -208,10 +222,10 @@ impl Plan {
         rectification: &Rectification,
     ) -> Result<(), GpuError> {
         let (slot, params) = slot(&mut self.rectify, index, rectification)?;
-        slot.bind(device, &self.image, planes, &params)
+        slot.bind(device, &self.sights, planes, &params)
     }
 
-    /// Writes `image` to be image `index` of the next submission, whose dispatches `source`'s goes in front of; and
+    /// Writes `image` to be image `index` of the next submission, of [`Self::steps_of`] this `source` and others; and
     /// how it becomes the canonical image. For those who have more sources than images a frame.
     ///
     /// # Errors
@@ -229,13 +243,13 @@ impl Plan {
             index: index as u32,
             ..*rectification
         };
-        source.write(device, &self.image, image, &params)
+        source.write(device, &self.sights, image, &params)
     }
 
     /// Images a frame.
     #[cfg(not(target_arch = "wasm32"))]
     pub(crate) fn batch(&self) -> usize {
-        self.image.batch
+        self.rectify.len()
     }
 
     /// The robot's mask: probabilities `[1, height, width]`.
@@ -254,11 +268,20 @@ impl Plan {
         &self.totals
     }
 
-    /// The dispatches from images to masks.
-    fn mask_steps(&self) -> impl Iterator<Item = &Step> {
+    /// The dispatches from the pictures of `sources` to masks.
+    fn mask_steps<'a>(
+        &'a self,
+        sources: impl Iterator<Item = &'a Rectify> + Clone,
+    ) -> impl Iterator<Item = &'a Step> {
+        let sight = |index| {
+            let steps = sources.clone();
+            steps.filter_map(move |source| source.steps().get(index))
+        };
         let coarse = self.coarse.iter().flat_map(Coarse::steps);
         let merged = self.merged.iter().map(|merged| &merged.step);
-        coarse.chain(self.mask.steps()).chain(merged)
+        let closer = sight(1);
+        let seen = sight(0).chain(coarse).chain(closer);
+        seen.chain(self.mask.steps()).chain(merged)
     }
 
     /// The dispatches from masks to joints.
@@ -270,14 +293,18 @@ impl Plan {
     /// The dispatches of a frame, in order; those of the joint network only `with_joints`. Coverage, which counts the
     /// frames that ran, is the last.
     pub fn steps(&self, with_joints: bool) -> impl Iterator<Item = &Step> {
-        self.rectify
-            .iter()
-            .filter_map(Rectify::step)
-            .chain(self.mask_steps())
-            .chain(
-                self.joint_steps()
-                    .take(if with_joints { usize::MAX } else { 0 }),
-            )
+        self.steps_of(self.rectify.iter(), with_joints)
+    }
+
+    /// The same of the pictures of others than its own `sources`, one an image of the batch.
+    pub(crate) fn steps_of<'a>(
+        &'a self,
+        sources: impl Iterator<Item = &'a Rectify> + Clone,
+        with_joints: bool,
+    ) -> impl Iterator<Item = &'a Step> {
+        let joints = if with_joints { usize::MAX } else { 0 };
+        self.mask_steps(sources)
+            .chain(self.joint_steps().take(joints))
             .chain([&self.coverage])
     }
 
@@ -374,7 +401,7 @@ impl Plan {
     /// Puts what [`Self::copy_masks`] copied into `frames`.
     pub(crate) fn put_masks(&self, frames: &mut [Frame], bytes: &[u8]) {
         let values = self.mask().values(bytes);
-        let plane = self.image.shape.height * self.image.shape.width;
+        let plane = self.shape.height * self.shape.width;
         for (frame, mask) in frames.iter_mut().zip(values.chunks_exact(plane)) {
             frame.mask = mask.to_vec();
         }
@@ -384,7 +411,7 @@ impl Plan {
     /// the GPU did not run this one: a submission that was refused, or that failed on Metal, maps its buffers all the
     /// same. Frames are to be read in the order of their submissions.
     pub(crate) fn frames_in(&mut self, bytes: &[u8]) -> Option<Vec<Frame>> {
-        let shape = self.image.shape;
+        let shape = self.shape;
         let (width, height) = (shape.width as u32, shape.height as u32);
         let (joints, rest) = bytes.split_at(self.joints().staging_size() as usize);
         let (totals, runs) = rest.split_at(self.totals.size() as usize);
@@ -476,7 +503,10 @@ impl Plan {
     ) -> Result<Vec<Vec<f32>>, GpuError> {
         self.mask().write(device, masks)?;
         let mut encoder = device.wgpu().create_command_encoder(&Default::default());
-        let sources = self.rectify.iter().filter_map(Rectify::step);
+        let sources = self
+            .rectify
+            .iter()
+            .filter_map(|source| source.steps().first());
         let steps = sources.chain(self.joint_steps()).chain([&self.coverage]);
         self.dispatch(&mut encoder, steps, None);
         self.copy_results(&mut encoder, &self.results);

@@ -3,10 +3,22 @@ use image::RgbaImage;
 use super::source::{Planes, SourceKind};
 use super::step::{Step, StepDescriptor, Tensors, Work};
 use super::tensor::Tensor;
+use super::zoom::Gazes;
 use super::{Device, GpuError};
 use crate::camera::Rectification;
 
-/// A source image, and its way into one image of a batch (`shaders/rectify.wgsl`): a texture of our own,
+/// What sees the sources of a batch: the canonical cameras, or others that look closer.
+#[derive(Debug, Clone)]
+pub struct Sight {
+    /// The layer's label.
+    pub label: &'static str,
+    /// Where they look.
+    pub gazes: Gazes,
+    /// What they see, `[3, height, width]` each.
+    pub image: Tensor,
+}
+
+/// A source image, and its way into one image of each of a batch's [`Sight`]s (`shaders/rectify.wgsl`): a texture of our own,
 /// made anew only when the size of what is written changes, or a host's.
 #[derive(Debug)]
 pub struct Rectify {
@@ -21,7 +33,8 @@ pub struct Rectify {
 struct Bound {
     source: Source,
     kind: SourceKind,
-    step: Step,
+    /// One a sight.
+    steps: Vec<Step>,
 }
 
 #[derive(Debug, PartialEq)]
@@ -46,15 +59,14 @@ impl Rectify {
         }
     }
 
-    /// Writes `image` and `params` at the queue's next submission. To be rectified into `output`
-    /// `[3, height, width]`, always the same.
+    /// Writes `image` and `params` at the queue's next submission. To be rectified for `sights`, always the same.
     ///
     /// # Errors
     /// An image beyond the adapter's limits, or too little memory.
     pub fn write(
         &mut self,
         device: &Device,
-        output: &Tensor,
+        sights: &[Sight],
         image: &RgbaImage,
         params: &Rectification,
     ) -> Result<(), GpuError> {
@@ -68,7 +80,7 @@ impl Rectify {
                 let texture = device.scoped(|| texture(device, width, height))?;
                 self.bind_source(
                     device,
-                    output,
+                    sights,
                     Source::Own(texture.clone()),
                     SourceKind::Storage,
                 )?;
@@ -90,15 +102,14 @@ impl Rectify {
     }
 
     /// Reads a host's `planes` from now on, and takes `params` from the queue's next submission on. To be
-    /// rectified into `output` `[3, height, width]`, always the same. Makes nothing where the planes are
-    /// those of the last time.
+    /// rectified for `sights`, always the same. Makes nothing where the planes are those of the last time.
     ///
     /// # Errors
     /// Planes that cannot be read: nothing is changed then.
     pub fn bind(
         &mut self,
         device: &Device,
-        output: &Tensor,
+        sights: &[Sight],
         planes: &Planes,
         params: &Rectification,
     ) -> Result<(), GpuError> {
@@ -106,15 +117,15 @@ impl Rectify {
             |bound: &Bound| matches!(&bound.source, Source::Host(host) if host == planes);
         if !self.bound.as_ref().is_some_and(is_bound) {
             let kind = planes.kind(device)?;
-            self.bind_source(device, output, Source::Host(planes.clone()), kind)?;
+            self.bind_source(device, sights, Source::Host(planes.clone()), kind)?;
         }
         self.write_params(device, params);
         Ok(())
     }
 
-    /// The dispatch; `None` without a source.
-    pub fn step(&self) -> Option<&Step> {
-        self.bound.as_ref().map(|bound| &bound.step)
+    /// The dispatches, one a sight; none without a source.
+    pub fn steps(&self) -> &[Step] {
+        self.bound.as_ref().map_or(&[], |bound| &bound.steps)
     }
 
     fn write_params(&mut self, device: &Device, params: &Rectification) {
@@ -128,7 +139,7 @@ impl Rectify {
     fn bind_source(
         &mut self,
         device: &Device,
-        output: &Tensor,
+        sights: &[Sight],
         source: Source,
         kind: SourceKind,
     ) -> Result<(), GpuError> {
@@ -150,23 +161,27 @@ impl Rectify {
                 planes.bytes()
             }
         };
-        let work = Work {
-            operations: 0,
-            bytes: bytes + 4 * output.shape.len() as u64,
-        };
-        let tensors = Tensors::to(output);
         let constants = match kind {
             SourceKind::Nv12(encoding) => encoding.constants().to_vec(),
             _ => Vec::new(),
         };
-        let step = device.scoped(|| match &self.bound {
-            Some(bound) if bound.kind == kind => {
-                Ok(bound.step.rebound(device, tensors, &bindings, work))
+        let before = self.bound.as_ref().filter(|bound| bound.kind == kind);
+        let before = before.map_or(&[][..], |bound| &bound.steps);
+        let step = |index: usize, sight: &Sight| {
+            let output = &sight.image;
+            let bindings = [&bindings[..], &[(6, sight.gazes.binding())]].concat();
+            let work = Work {
+                operations: 0,
+                bytes: bytes + 4 * output.shape.len() as u64,
+            };
+            let tensors = Tensors::to(output);
+            if let Some(step) = before.get(index) {
+                return Ok(step.rebound(device, tensors, &bindings, work));
             }
-            _ => Step::new(
+            Step::new(
                 device,
                 &StepDescriptor {
-                    label: "rectify",
+                    label: sight.label,
                     kernel: "rectify",
                     source: kind.text(),
                     entry_point: "main",
@@ -177,9 +192,15 @@ impl Rectify {
                     workgroups: (output.shape.height * output.shape.width).div_ceil(64),
                     work,
                 },
-            ),
-        })?;
-        self.bound = Some(Bound { source, kind, step });
+            )
+        };
+        let steps = sights.iter().enumerate().map(|(i, sight)| step(i, sight));
+        let steps = device.scoped(|| steps.collect())?;
+        self.bound = Some(Bound {
+            source,
+            kind,
+            steps,
+        });
         Ok(())
     }
 }

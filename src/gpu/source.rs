@@ -74,6 +74,7 @@ impl SourceKind {
         macro_rules! rectify {
             ($file:literal) => {
                 concat!(
+                    include_str!("../../shaders/gaze.wgsl"),
                     include_str!("../../shaders/rectify.wgsl"),
                     include_str!(concat!("../../shaders/", $file, ".wgsl"))
                 )

@@ -2,27 +2,52 @@ use super::overlay::share_constants;
 use super::step::{Step, StepDescriptor, Tensors, Work};
 use super::tensor::{Tensor, storage_buffer};
 use super::{Device, GpuError};
-use crate::camera::Intrinsics;
+use crate::camera::{Gaze, Intrinsics};
 use crate::network::{Overlay, Zoom};
 
-/// Bytes of a camera, as `shaders/zoom_camera.wgsl` lays it out.
-const GAZE_SIZE: usize = 48;
-
 /// A network's cameras of a batch: turned to the robots and zoomed in on them, on the GPU.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Gazes {
     buffer: wgpu::Buffer,
     canonical: Intrinsics,
 }
 
 impl Gazes {
-    /// For `batch` images of the `canonical` camera. Driver errors reach the caller's [`Device::scoped`].
+    /// For `batch` images, each the `canonical` camera until it is turned. Driver errors reach the caller's
+    /// [`Device::scoped`].
     ///
     /// # Errors
     /// More images than a buffer holds.
     pub fn new(device: &Device, canonical: Intrinsics, batch: usize) -> Result<Self, GpuError> {
-        let buffer = storage_buffer(device, "zoom: cameras", (batch * GAZE_SIZE) as u64)?;
-        Ok(Self { buffer, canonical })
+        let size = size_of::<[f32; GAZE]>() as u64;
+        let size = size.saturating_mul(batch as u64);
+        let buffer = storage_buffer(device, "zoom: cameras", size)?;
+        let gazes = Self { buffer, canonical };
+        gazes.write(device, &vec![Gaze::CANONICAL; batch])?;
+        Ok(gazes)
+    }
+
+    /// Turns them to `each`, from the queue's next submission on.
+    ///
+    /// # Errors
+    /// Another number than there are images.
+    pub fn write(&self, device: &Device, each: &[Gaze]) -> Result<(), GpuError> {
+        let values: Vec<f32> = each.iter().flat_map(laid_out).collect();
+        let bytes: &[u8] = bytemuck::cast_slice(&values);
+        if bytes.len() as u64 != self.buffer.size() {
+            return Err(GpuError::Size {
+                what: "zoom: cameras",
+                expected: self.buffer.size() as usize / size_of::<[f32; GAZE]>(),
+                found: each.len(),
+            });
+        }
+        device.queue().write_buffer(&self.buffer, 0, bytes);
+        Ok(())
+    }
+
+    /// For a kernel that sees through them.
+    pub(super) fn binding(&self) -> wgpu::BindingResource<'_> {
+        self.buffer.as_entire_binding()
     }
 
     /// Turns them to what the overlay's `rule` shows by each `mask` `[1, height, width]` (`shaders/zoom.wgsl`).
@@ -55,26 +80,6 @@ impl Gazes {
                 ("MOST", f64::from(zoom.most)),
             ],
             mask.batch,
-        )
-    }
-
-    /// What they see of `image` (`shaders/zoom_image.wgsl`): four channels at most, to `output` of the same
-    /// shape.
-    ///
-    /// # Errors
-    /// More pixels than a dispatch holds. Driver errors reach the caller's [`Device::scoped`].
-    pub fn zoom_image(
-        &self,
-        device: &Device,
-        image: &Tensor,
-        output: &Tensor,
-    ) -> Result<Step, GpuError> {
-        self.step(
-            device,
-            ("zoom_image", include_str!("../../shaders/zoom_image.wgsl")),
-            Tensors::from_to(image, output),
-            &[],
-            output.texels().div_ceil(64),
         )
     }
 
@@ -158,7 +163,10 @@ impl Gazes {
         constants: &[(&str, f64)],
         workgroups: usize,
     ) -> Result<Step, GpuError> {
-        let camera = include_str!("../../shaders/zoom_camera.wgsl");
+        let camera = concat!(
+            include_str!("../../shaders/gaze.wgsl"),
+            include_str!("../../shaders/zoom_camera.wgsl")
+        );
         let Intrinsics { fx, fy, cx, cy } = self.canonical;
         let mut all = vec![("FX", fx), ("FY", fy), ("CX", cx), ("CY", cy)];
         all.extend(constants);
@@ -173,7 +181,7 @@ impl Gazes {
                 tensors,
                 constants: &all,
                 sizes: &[],
-                bindings: &[(3, self.buffer.as_entire_binding())],
+                bindings: &[(3, self.binding())],
                 workgroups,
                 work: Work {
                     bytes: work.bytes + self.buffer.size(),
@@ -182,4 +190,17 @@ impl Gazes {
             },
         )
     }
+}
+
+/// Numbers of a camera, as `shaders/gaze.wgsl` lays it out.
+const GAZE: usize = 12;
+
+fn laid_out(gaze: &Gaze) -> [f32; GAZE] {
+    let [right, down, ahead] = gaze.rotation;
+    let rows = [(right, gaze.zoom), (down, 0.0), (ahead, 0.0)];
+    let mut values = [0.0; GAZE];
+    for (place, ([x, y, z], w)) in values.as_chunks_mut().0.iter_mut().zip(rows) {
+        *place = [x, y, z, w];
+    }
+    values
 }

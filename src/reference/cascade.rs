@@ -1,31 +1,27 @@
-use super::{
-    Gaze, Tensor, kinematic_fit, overlay, run, zoom, zoom_image, zoom_joints, zoom_mask,
-    zoom_overlay,
-};
-use crate::camera::Intrinsics;
+use super::{Tensor, kinematic_fit, overlay, run, zoom, zoom_joints, zoom_mask, zoom_overlay};
+use crate::camera::{Gaze, Intrinsics};
 use crate::network::{Description, Model, Overlay, Zoom};
 
-/// The mask of the robot in `image`: the mask network's and, where `model` has a coarse network, that one's beyond what its camera
-/// sees. `None` where the image is not what the networks take.
-pub fn mask(model: &Model, image: &Tensor) -> Option<Tensor> {
+/// The mask of the robot in `image`, the canonical camera's: the mask network's and, where `model` has a coarse network, that one's
+/// beyond what its camera sees. `rectified` gives what a camera sees of the picture that `image` was made from. `None` where the images
+/// are not what the networks take.
+pub fn mask(
+    model: &Model,
+    image: &Tensor,
+    rectified: impl FnOnce(&Gaze) -> Tensor,
+) -> Option<Tensor> {
     let Some((network, rules)) = model.coarse() else {
         return run(&model.mask_network, image);
     };
     let (coarse, camera) = (run(network, image)?, &model.description.camera);
-    let (seen, gaze) = mask_input(image, &coarse, camera, rules);
-    let closer = run(&model.mask_network, &seen)?;
+    let gaze = mask_gaze(&coarse, camera, rules);
+    let closer = run(&model.mask_network, &rectified(&gaze))?;
     Some(zoom_mask(&closer, &coarse, camera, &gaze))
 }
 
-/// The mask network's input behind a coarse network, and where it looks from: what it sees of `image` by the `coarse` mask.
-pub fn mask_input(
-    image: &Tensor,
-    coarse: &Tensor,
-    camera: &Intrinsics,
-    rules: Zoom,
-) -> (Tensor, Gaze) {
-    let gaze = zoom(coarse, Overlay::Multiply {}, camera, rules);
-    (zoom_image(image, camera, &gaze), gaze)
+/// Where the mask network looks behind a coarse network: to the `coarse` mask, each pixel as heavy as it is probable.
+pub fn mask_gaze(coarse: &Tensor, camera: &Intrinsics, rules: Zoom) -> Gaze {
+    zoom(coarse, Overlay::Multiply {}, camera, rules)
 }
 
 /// The joint network's input, and where it looks from unless that is the canonical camera: the overlay of `image` and

@@ -21,7 +21,7 @@ mod upsample2d;
 mod zoom;
 
 pub use back_project::back_project;
-pub use cascade::{joint_input, joints, mask, mask_input};
+pub use cascade::{joint_input, joints, mask, mask_gaze};
 pub use concat::concat;
 pub use conv2d::conv2d;
 pub use coverage::coverage;
@@ -35,7 +35,7 @@ pub use sigmoid::sigmoid;
 pub use soft_argmax2d::soft_argmax2d;
 pub use unrectify::unrectify;
 pub use upsample2d::upsample2d;
-pub use zoom::{Gaze, zoom, zoom_image, zoom_joints, zoom_mask, zoom_overlay};
+pub use zoom::{zoom, zoom_joints, zoom_mask, zoom_overlay};
 
 use crate::network::{Activation, Shape};
 

@@ -2,23 +2,29 @@ use image::{Rgba, RgbaImage};
 use rayon::prelude::*;
 
 use super::Tensor;
-use crate::camera::Rectification;
+use crate::camera::{Gaze, Rectification};
 use crate::network::Shape;
 
-/// Undistorts and resamples `image` into the canonical pinhole camera: `[3, height, width]`, values
-/// in [0, 1], alpha ignored.
+/// Undistorts and resamples `image` into what `gaze` sees, the canonical pinhole camera or one that looks closer:
+/// `[3, height, width]`, values in [0, 1], alpha ignored.
 ///
 /// `image` holds the source's pixels where [`Rectification::texels`] says.
 ///
 /// A pixel is the mean of a grid of bilinear samples over its footprint in the source, as many as
 /// the footprint has pixels. What the source does not show is black. In f32 as the kernel.
-pub fn rectify(image: &RgbaImage, params: &Rectification, height: usize, width: usize) -> Tensor {
+pub fn rectify(
+    image: &RgbaImage,
+    params: &Rectification,
+    gaze: &Gaze,
+    height: usize,
+    width: usize,
+) -> Tensor {
     let mut output = Tensor::full(Shape::new(3, height, width), 0.0);
     let rows: Vec<Vec<[f32; 3]>> = (0..height)
         .into_par_iter()
         .map(|y| {
             (0..width)
-                .map(|x| pixel(image, params, [x as f32, y as f32]))
+                .map(|x| pixel(image, params, gaze, [x as f32, y as f32]))
                 .collect()
         })
         .collect();
@@ -31,10 +37,11 @@ pub fn rectify(image: &RgbaImage, params: &Rectification, height: usize, width: 
     output
 }
 
-fn pixel(image: &RgbaImage, params: &Rectification, [x, y]: [f32; 2]) -> [f32; 3] {
-    let ray = |x, y| ray_of(params, [x, y]);
+fn pixel(image: &RgbaImage, params: &Rectification, gaze: &Gaze, [x, y]: [f32; 2]) -> [f32; 3] {
+    let ray = |x, y| at_one(ray_of(params, gaze, [x, y]));
     let [rx, ry] = ray(x, y);
-    if rx * rx + ry * ry > params.max_radius * params.max_radius {
+    let [_, _, z] = ray_of(params, gaze, [x, y]);
+    if !(z > AHEAD && rx * rx + ry * ry <= params.max_radius * params.max_radius) {
         return [0.0; 3];
     }
     let difference = |a: [f32; 2], b: [f32; 2]| [a[0] - b[0], a[1] - b[1]];
@@ -65,9 +72,20 @@ fn pixel(image: &RgbaImage, params: &Rectification, [x, y]: [f32; 2]) -> [f32; 3
     sum.map(|value| value * (step[0] * step[1]))
 }
 
-fn ray_of(params: &Rectification, pixel: [f32; 2]) -> [f32; 2] {
+/// Where a pixel looks, in the canonical camera's frame.
+fn ray_of(params: &Rectification, gaze: &Gaze, pixel: [f32; 2]) -> [f32; 3] {
     let [scale_x, scale_y, cx, cy] = params.canonical;
-    [(pixel[0] - cx) * scale_x, (pixel[1] - cy) * scale_y]
+    let seen = [(pixel[0] - cx) * scale_x, (pixel[1] - cy) * scale_y].map(|v| v / gaze.zoom);
+    gaze.turned_back([seen[0], seen[1], 1.0])
+}
+
+/// What is less far ahead is beside the camera or behind it.
+const AHEAD: f32 = 1e-3;
+
+/// At z = 1, for what is ahead.
+fn at_one([x, y, z]: [f32; 3]) -> [f32; 2] {
+    let z = z.max(AHEAD);
+    [x / z, y / z]
 }
 
 /// Where a ray at z = 1 lands in the source, in pixels.

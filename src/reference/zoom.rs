@@ -1,35 +1,6 @@
 use super::{Tensor, overlay};
-use crate::camera::Intrinsics;
+use crate::camera::{Gaze, Intrinsics};
 use crate::network::{Overlay, Shape, Zoom};
-
-/// A camera that a network looks through: where the canonical camera is, turned to the robot, zoomed in on it.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Gaze {
-    /// Rows of the rotation from the canonical camera's frame to this one's.
-    pub rotation: [[f32; 3]; 3],
-    /// Its focal length, as a multiple of the canonical camera's.
-    pub zoom: f32,
-}
-
-impl Gaze {
-    /// The canonical camera itself.
-    pub const CANONICAL: Self = Self {
-        rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
-        zoom: 1.0,
-    };
-
-    /// What lies in the direction `ray` of the canonical camera's frame, in this one's.
-    fn turned(&self, ray: [f32; 3]) -> [f32; 3] {
-        let along = |axis: [f32; 3]| axis[0] * ray[0] + axis[1] * ray[1] + axis[2] * ray[2];
-        self.rotation.map(along)
-    }
-
-    /// What lies in the direction `seen`, in the canonical camera's frame.
-    fn turned_back(&self, seen: [f32; 3]) -> [f32; 3] {
-        let [right, down, ahead] = self.rotation;
-        [0, 1, 2].map(|axis| right[axis] * seen[0] + down[axis] * seen[1] + ahead[axis] * seen[2])
-    }
-}
 
 /// Steps of a zoom in an octave, and of a direction in the width of what the camera sees: roundings and noise in a mask, which move
 /// its mean by hundredths of a pixel, leave the camera where it is.
@@ -95,11 +66,6 @@ pub fn zoom_overlay(
 ) -> Tensor {
     let [seen, covered] = [image, mask].map(|source| sampled(source, camera, gaze));
     overlay(&seen, &covered, rule)
-}
-
-/// `image` of the canonical `camera` as `gaze` sees it: sampled bilinearly, black beyond its borders.
-pub fn zoom_image(image: &Tensor, camera: &Intrinsics, gaze: &Gaze) -> Tensor {
-    sampled(image, camera, gaze)
 }
 
 /// The canonical `camera`'s mask: `closer`, what `gaze` sees of it, sampled bilinearly as far as it sees, `coarse` beyond, and

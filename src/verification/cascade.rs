@@ -2,7 +2,7 @@ use image::{Rgba, RgbaImage, imageops};
 
 use super::comparison::Comparison;
 use super::stages::numbers;
-use crate::camera::{Camera, Distortion, Intrinsics, Rectification};
+use crate::camera::{Camera, Distortion, Gaze, Intrinsics, Rectification};
 use crate::gpu::{Device, Frame, GpuError, Plan, Precision};
 use crate::network::Model;
 use crate::reference;
@@ -41,13 +41,15 @@ pub(super) async fn compare(
         plan.write(device, 0, &picture, &params)?;
         frames.extend(plan.run_async(device, true, true).await?);
         let (rows, columns) = (input.height as usize, input.width as usize);
-        images.push(reference::rectify(&picture, &params, rows, columns));
+        let rectified =
+            move |gaze: &Gaze| reference::rectify(&picture, &params, gaze, rows, columns);
+        images.push(rectified);
     }
     let [mask_allowed, joints_allowed] = allowed(precision, model.description.arm.is_some());
     let mut parts = [Vec::new(), Vec::new(), Vec::new()];
     // The control is the answer to the other picture.
-    for ((image, frame), other) in images.iter().zip(&frames).zip(frames.iter().rev()) {
-        let expected = expected(model, image, &frame.mask).unwrap_or(Frame {
+    for ((rectified, frame), other) in images.iter().zip(&frames).zip(frames.iter().rev()) {
+        let expected = expected(model, rectified, &frame.mask).unwrap_or(Frame {
             joints: Vec::new(),
             mask: Vec::new(),
             ..frame.clone()
@@ -65,12 +67,17 @@ pub(super) async fn compare(
     Ok(parts)
 }
 
-/// What the reference makes of `image`: the mask; and behind `mask`, coverage and joints. `None` where the
-/// networks do not fit together.
-fn expected(model: &Model, image: &reference::Tensor, mask: &[f32]) -> Option<Frame> {
+/// What the reference makes of a picture, of which `rectified` gives what a camera sees: the mask; and behind `mask`, coverage
+/// and joints. `None` where the networks do not fit together.
+fn expected(
+    model: &Model,
+    rectified: impl Fn(&Gaze) -> reference::Tensor,
+    mask: &[f32],
+) -> Option<Frame> {
     let description = &model.description;
     let presence = description.presence;
-    let expected = reference::mask(model, image)?;
+    let image = &rectified(&Gaze::CANONICAL);
+    let expected = reference::mask(model, image, rectified)?;
     let mask = reference::Tensor::new(expected.shape(), mask.to_vec())?;
     Some(Frame {
         coverage: reference::coverage(&mask, presence.mask_threshold, presence.sure_threshold),

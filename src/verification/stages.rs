@@ -5,8 +5,12 @@ use wgpu::{BufferUsages, TextureFormat, TextureUsages};
 use super::comparison::Comparison;
 use super::kernel::{BATCHES, Case, rounding_of, storable, submit, with_first};
 use super::random::Random;
-use crate::camera::{Camera, Crop, Distortion, Intrinsics, Rectification, Texels, Unrectification};
-use crate::gpu::{self, Device, GpuError, Layout, Planes, Rectify, Tensor, Totals, Unrectify, Yuv};
+use crate::camera::{
+    Camera, Crop, Distortion, Gaze, Intrinsics, Rectification, Texels, Unrectification,
+};
+use crate::gpu::{
+    self, Device, Gazes, GpuError, Layout, Planes, Rectify, Sight, Tensor, Totals, Unrectify, Yuv,
+};
 use crate::network::{Coverage, Overlay, Shape};
 use crate::reference;
 
@@ -153,6 +157,24 @@ fn plane(
     texture.create_view(&Default::default())
 }
 
+/// Turned by 14 degrees, so that a part of what it sees is beyond the picture.
+const CLOSER: Gaze = Gaze {
+    rotation: [
+        [
+            1.0 - 16.0 / (33.0 * 65.0),
+            -28.0 / (33.0 * 65.0),
+            -4.0 / 33.0,
+        ],
+        [
+            -28.0 / (33.0 * 65.0),
+            1.0 - 49.0 / (33.0 * 65.0),
+            -7.0 / 33.0,
+        ],
+        [4.0 / 33.0, 7.0 / 33.0, 32.0 / 33.0],
+    ],
+    zoom: 1.5,
+};
+
 pub(super) async fn rectify(
     device: &Device,
     layout: Layout,
@@ -165,6 +187,7 @@ pub(super) async fn rectify(
         Orientation::FlipHorizontal,
         Orientation::Rotate180,
     ]);
+    let gaze = case.turn(&[Gaze::CANONICAL, CLOSER]);
     let random = &mut case.random;
     let [width, height] = [0; 2].map(|_| random.of(&[31_u32, 64, 101, 150]));
     let camera = Camera {
@@ -178,21 +201,29 @@ pub(super) async fn rectify(
         ..Rectification::new(&camera, &canonical, columns as u32, rows as u32)
     };
     let picture = Picture::new(width, height, random, source);
-    let expected = reference::rectify(&picture.colours, &params, rows, columns);
+    let expected = reference::rectify(&picture.colours, &params, &gaze, rows, columns);
 
     let output = Tensor::in_layout(device, layout, "output", expected.shape(), 1, 0)?;
-    let mut rectify = device.scoped(|| Ok(Rectify::new(device)))?;
+    let (gazes, mut rectify) = device.scoped(|| {
+        let gazes = Gazes::new(device, canonical, 1)?;
+        gazes.write(device, &[gaze])?;
+        Ok((gazes, Rectify::new(device)))
+    })?;
+    let sights = [Sight {
+        label: "rectify",
+        gazes,
+        image: output.clone(),
+    }];
     let mut run = async |picture: &Picture| {
         match source {
-            Source::Storage => rectify.write(device, &output, &picture.bytes, &params)?,
-            _ => rectify.bind(device, &output, &picture.planes(device, source)?, &params)?,
+            Source::Storage => rectify.write(device, &sights, &picture.bytes, &params)?,
+            _ => rectify.bind(device, &sights, &picture.planes(device, source)?, &params)?,
         }
         submit(device, |encoder| {
             let mut pass = encoder.begin_compute_pass(&Default::default());
-            rectify
-                .step()
-                .into_iter()
-                .for_each(|step| step.encode(&mut pass));
+            for step in rectify.steps() {
+                step.encode(&mut pass);
+            }
         })?;
         output.read_async(device).await
     };

@@ -9,7 +9,6 @@ use crate::reference;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Part {
     Camera,
-    Image,
     Mask,
     Overlay,
     Joints,
@@ -65,7 +64,6 @@ pub(super) async fn compare(
         let gazes = Gazes::new(device, camera, batch)?;
         let zoom = gazes.zoom(device, &second, ZOOM, RULE)?;
         let last = match part {
-            Part::Image => gazes.zoom_image(device, &input, &overlay)?,
             Part::Mask => gazes.zoom_mask(device, &closer, &second, &merged)?,
             Part::Overlay => gazes.zoom_overlay(device, &input, &second, &overlay, RULE)?,
             Part::Camera | Part::Joints => gazes.zoom_joints(device, &sights, &joints)?,
@@ -73,7 +71,7 @@ pub(super) async fn compare(
         Ok([zoom, last])
     })?;
     let output = match part {
-        Part::Image | Part::Overlay => &overlay,
+        Part::Overlay => &overlay,
         Part::Mask => &merged,
         Part::Camera | Part::Joints => &joints,
     };
@@ -93,7 +91,7 @@ pub(super) async fn compare(
     let found = run(&image, &mask, &seen).await?;
     let control = match part {
         Part::Camera => run(&image, &other_half(&mask, one), &seen).await?,
-        Part::Image | Part::Mask | Part::Overlay => {
+        Part::Mask | Part::Overlay => {
             run(
                 &image.iter().map(|v| v + 1.0).collect::<Vec<_>>(),
                 &mask,
@@ -114,7 +112,6 @@ pub(super) async fn compare(
             let mask = reference::Tensor::new(one, mask.to_vec())?;
             let gaze = reference::zoom(&mask, RULE, &camera, ZOOM);
             let output = match part {
-                Part::Image => reference::zoom_image(&image, &camera, &gaze),
                 Part::Mask => {
                     let closer = first_channels(image.data(), shape);
                     let closer = reference::Tensor::new(one, closer)?;

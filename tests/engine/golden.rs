@@ -3,7 +3,9 @@
 use std::path::PathBuf;
 
 use crate::common::{difference, with_one_weight_changed};
+use image::{Rgba, RgbaImage};
 use safetensors::SafeTensors;
+use whereabot::camera::{Camera, Distortion, Gaze, Intrinsics, Rectification};
 use whereabot::gpu::{NetworkPlan, Precision};
 use whereabot::network::{Model, Network, Shape};
 use whereabot::reference;
@@ -140,12 +142,18 @@ fn what_a_coarse_mask_turns_agrees_with_pytorch() {
     let (network, camera) = (&model.mask_network, &model.description.camera);
     let coarse = model.coarse_network.as_ref().unwrap();
     let zoom = model.description.coarse.as_ref().unwrap().zoom;
-    let image = input(name, "coarse.image", coarse.input());
+    let shape = coarse.input();
+    let image = input(name, "coarse.image", shape);
     let coarse = input(name, &last("coarse", coarse), coarse.output());
-    let (seen, gaze) = reference::mask_input(&image, &coarse, camera, zoom);
+    let gaze = reference::mask_gaze(&coarse, camera, zoom);
+    let (source, params) = source(name, &model);
+    let rectified =
+        |gaze: &Gaze| reference::rectify(&source, &params, gaze, shape.height, shape.width);
+    let seen = rectified(&gaze);
     let apart = |found: &reference::Tensor, tensor: &str| {
         difference(found.data(), &golden(name, tensor)).unwrap()
     };
+    assert!(apart(&rectified(&Gaze::CANONICAL), "coarse.image") <= 1e-5);
     assert!(apart(&seen, "mask.image") <= 1e-5);
     assert!(apart(&image, "mask.image") > 1e-2);
     let closer = reference::run(network, &seen).unwrap();
@@ -156,7 +164,35 @@ fn what_a_coarse_mask_turns_agrees_with_pytorch() {
     }
     let merged = reference::zoom_mask(&closer, &coarse, camera, &gaze);
     assert!(apart(&merged, "merged") <= 1e-5);
-    assert!(apart(&reference::mask(&model, &image).unwrap(), "merged") <= 1e-5);
+    let found = reference::mask(&model, &image, rectified).unwrap();
+    assert!(apart(&found, "merged") <= 1e-5);
+}
+
+/// The picture that the cascade's input was made from, of twice the networks' size.
+fn source(name: &str, model: &Model) -> (RgbaImage, Rectification) {
+    let input = model.description.input;
+    let (width, height) = (2 * input.width, 2 * input.height);
+    let values = golden(name, "source");
+    let plane = (width * height) as usize;
+    let image = RgbaImage::from_fn(width, height, |x, y| {
+        let at = (y * width + x) as usize;
+        let [r, g, b] = [0, 1, 2].map(|c| (255.0 * values[c * plane + at]).round() as u8);
+        Rgba([r, g, b, 255])
+    });
+    let canonical = model.description.camera;
+    let camera = Camera {
+        width,
+        height,
+        intrinsics: Intrinsics {
+            fx: 2.0 * canonical.fx,
+            fy: 2.0 * canonical.fy,
+            cx: 2.0 * canonical.cx + 0.5,
+            cy: 2.0 * canonical.cy + 0.5,
+        },
+        distortion: Distortion::None,
+    };
+    let params = Rectification::new(&camera, &canonical, input.width, input.height);
+    (image, params)
 }
 
 /// The tensor of the network's last layer.

@@ -3,8 +3,8 @@
 use crate::common::{ORIENTATIONS, cases, device, difference, narrow_device, noise, run_step};
 use image::{DynamicImage, Rgba, RgbaImage};
 use proptest::prelude::*;
-use whereabot::camera::{Camera, Crop, Distortion, Intrinsics, Rectification, Texels};
-use whereabot::gpu::{Device, Planes, Rectify, Tensor, Yuv};
+use whereabot::camera::{Camera, Crop, Distortion, Gaze, Intrinsics, Rectification, Texels};
+use whereabot::gpu::{Device, Gazes, Planes, Rectify, Sight, Tensor, Yuv};
 use whereabot::network::Shape;
 use whereabot::reference;
 
@@ -17,32 +17,63 @@ fn canonical(width: u32, height: u32) -> Intrinsics {
     }
 }
 
-fn on_gpu(image: &RgbaImage, params: &Rectification, width: usize, height: usize) -> Vec<f32> {
-    on_device(&device(), image, params, width, height)
+/// A camera that looks to `(x, y)` at z = 1.
+fn towards(x: f32, y: f32, zoom: f32) -> Gaze {
+    let length = (x * x + y * y + 1.0).sqrt();
+    let [x, y, z] = [x / length, y / length, 1.0 / length];
+    let [bent_x, bent_y] = [x / (1.0 + z), y / (1.0 + z)];
+    Gaze {
+        rotation: [
+            [1.0 - x * bent_x, -x * bent_y, -x],
+            [-y * bent_x, 1.0 - y * bent_y, -y],
+            [x, y, z],
+        ],
+        zoom,
+    }
 }
 
-fn on_device(
-    device: &Device,
+fn sight(device: &Device, gaze: Gaze, width: usize, height: usize) -> Sight {
+    let camera = canonical(width as u32, height as u32);
+    let gazes = device.scoped(|| Gazes::new(device, camera, 1)).unwrap();
+    gazes.write(device, &[gaze]).unwrap();
+    Sight {
+        label: "rectify",
+        gazes,
+        image: Tensor::new(device, "output", Shape::new(3, height, width), 1).unwrap(),
+    }
+}
+
+fn on_gpu(image: &RgbaImage, params: &Rectification, width: usize, height: usize) -> Vec<f32> {
+    let device = device();
+    let sight = sight(&device, Gaze::CANONICAL, width, height);
+    on_device(&device, image, params, sight)
+}
+
+fn on_reference(
     image: &RgbaImage,
     params: &Rectification,
-    width: usize,
-    height: usize,
-) -> Vec<f32> {
-    let output = Tensor::new(device, "output", Shape::new(3, height, width), 1).unwrap();
+    rows: usize,
+    columns: usize,
+) -> reference::Tensor {
+    reference::rectify(image, params, &Gaze::CANONICAL, rows, columns)
+}
+
+fn on_device(device: &Device, image: &RgbaImage, params: &Rectification, sight: Sight) -> Vec<f32> {
     let mut rectify = device.scoped(|| Ok(Rectify::new(device))).unwrap();
-    rectify.write(device, &output, image, params).unwrap();
-    run_step(device, rectify.step().unwrap());
-    output.read(device).unwrap()
+    let sights = [sight];
+    rectify.write(device, &sights, image, params).unwrap();
+    run_step(device, &rectify.steps()[0]);
+    sights[0].image.read(device).unwrap()
 }
 
 /// The same of a host's textures, rectified into 64 x 53.
 fn of_planes(planes: &Planes, params: &Rectification) -> Vec<f32> {
     let device = device();
-    let output = Tensor::new(&device, "output", Shape::new(3, 53, 64), 1).unwrap();
+    let sights = [sight(&device, Gaze::CANONICAL, 64, 53)];
     let mut rectify = device.scoped(|| Ok(Rectify::new(&device))).unwrap();
-    rectify.bind(&device, &output, planes, params).unwrap();
-    run_step(&device, rectify.step().unwrap());
-    output.read(&device).unwrap()
+    rectify.bind(&device, &sights, planes, params).unwrap();
+    run_step(&device, &rectify.steps()[0]);
+    sights[0].image.read(&device).unwrap()
 }
 
 fn texture(
@@ -114,17 +145,80 @@ proptest! {
         (out_width, out_height) in (1_u32..70, 1_u32..70),
         hfov in 0.4..1.8_f64,
         distortion in any_distortion(),
+        gaze in prop_oneof![
+            Just(Gaze::CANONICAL),
+            (-0.6..0.6_f32, -0.6..0.6_f32, 0.5..4.0_f32).prop_map(|(x, y, zoom)| towards(x, y, zoom)),
+        ],
         seed in any::<u32>(),
     ) {
         let camera = Camera { distortion, ..Camera::from_hfov(width, height, hfov) };
         let image = picture(width, height, seed.into());
         let params = Rectification::new(&camera, &canonical(out_width, out_height), out_width, out_height);
         let (columns, rows) = (out_width as usize, out_height as usize);
-        let expected = reference::rectify(&image, &params, rows, columns);
-        let found = on_gpu(&image, &params, columns, rows);
+        let expected = reference::rectify(&image, &params, &gaze, rows, columns);
+        let device = device();
+        let found = on_device(&device, &image, &params, sight(&device, gaze, columns, rows));
         let found = difference(&found, expected.data()).unwrap();
         prop_assert!(found <= 2e-4, "{found}");
     }
+}
+
+/// A frame's images are of several cameras: each sees by its own gaze.
+#[test]
+fn a_camera_that_looks_closer_sees_the_picture_s_own_pixels() {
+    let device = device();
+    let camera = Camera::from_hfov(400, 300, 0.9);
+    let params = Rectification {
+        index: 1,
+        ..Rectification::new(&camera, &camera.intrinsics, 64, 53)
+    };
+    let image = picture(400, 300, 9);
+    // Its focal length is the picture's: what it sees are pixels of the picture.
+    let scale = 64.0 / 400.0;
+    let params = Rectification {
+        canonical: [
+            (1.0 / (scale * camera.intrinsics.fx)) as f32,
+            (1.0 / (scale * camera.intrinsics.fy)) as f32,
+            31.5,
+            25.5,
+        ],
+        samples: [1, 1],
+        ..params
+    };
+    let gaze = towards(0.0, 0.0, (1.0 / scale) as f32);
+    let gazes = device
+        .scoped(|| Gazes::new(&device, camera.intrinsics, 2))
+        .unwrap();
+    gazes.write(&device, &[Gaze::CANONICAL, gaze]).unwrap();
+    assert!(gazes.write(&device, &[gaze]).is_err());
+    let sights = [Sight {
+        label: "rectify",
+        gazes,
+        image: Tensor::new(&device, "output", Shape::new(3, 53, 64), 2).unwrap(),
+    }];
+    let mut rectify = device.scoped(|| Ok(Rectify::new(&device))).unwrap();
+    rectify.write(&device, &sights, &image, &params).unwrap();
+    run_step(&device, &rectify.steps()[0]);
+    let found = sights[0]
+        .image
+        .read(&device)
+        .unwrap()
+        .split_off(3 * 53 * 64);
+    let (left, top) = (
+        (camera.intrinsics.cx - 31.5) as u32,
+        (camera.intrinsics.cy - 25.5) as u32,
+    );
+    let part = |left: u32| -> Vec<f32> {
+        (0..3 * 53 * 64)
+            .map(|i| {
+                let (channel, y, x) = (i / (53 * 64), i as u32 / 64 % 53, i as u32 % 64);
+                f32::from(image.get_pixel(left + x, top + y)[channel]) / 255.0
+            })
+            .collect()
+    };
+    assert!(difference(&found, &part(left)).unwrap() <= 2e-3);
+    // Negative control: a pixel beside.
+    assert!(difference(&found, &part(left + 1)).unwrap() > 2e-2);
 }
 
 #[test]
@@ -150,7 +244,7 @@ fn the_recorder_s_camera_is_halved_exactly() {
             mean[at] += f32::from(pixel[channel]) / (4.0 * 255.0);
         }
     }
-    let reference = reference::rectify(&image, &params, 212, 256);
+    let reference = on_reference(&image, &params, 212, 256);
     assert!(difference(reference.data(), &mean).unwrap() < 1e-4);
     assert!(difference(&on_gpu(&image, &params, 256, 212), &mean).unwrap() < 1e-4);
     // Negative control: a principal point off by one pixel.
@@ -252,7 +346,7 @@ fn beyond_the_lens_there_is_black() {
     assert!(params.max_radius < 1.0);
     for values in [
         on_gpu(&image, &params, 64, 64),
-        reference::rectify(&image, &params, 64, 64).data().to_vec(),
+        on_reference(&image, &params, 64, 64).data().to_vec(),
     ] {
         assert_eq!(values[0], 0.0);
         assert!(values[32 * 64 + 32] > 0.99);
@@ -266,8 +360,14 @@ fn more_workgroups_than_one_dimension_holds() {
     let image = picture(64, 60, 5);
     let params = Rectification::new(&camera, &canonical(width, height), width, height);
     let (columns, rows) = (width as usize, height as usize);
-    let expected = reference::rectify(&image, &params, rows, columns);
-    let found = on_device(&narrow_device(16), &image, &params, columns, rows);
+    let expected = on_reference(&image, &params, rows, columns);
+    let narrow = narrow_device(16);
+    let found = on_device(
+        &narrow,
+        &image,
+        &params,
+        sight(&narrow, Gaze::CANONICAL, columns, rows),
+    );
     assert!(difference(&found, expected.data()).unwrap() <= 2e-4);
     // Negative control: the last row holds more than zeros.
     assert!(
@@ -283,7 +383,7 @@ fn every_format_shows_the_same() {
     let image = picture(90, 70, 1);
     let camera = Camera::from_hfov(90, 70, 1.2);
     let params = Rectification::new(&camera, &canonical(64, 53), 64, 53);
-    let expected = reference::rectify(&image, &params, 53, 64);
+    let expected = on_reference(&image, &params, 53, 64);
     let mut swapped = image.clone();
     swapped.pixels_mut().for_each(|pixel| pixel.0.swap(0, 2));
     for (format, right, wrong) in [
@@ -337,7 +437,7 @@ fn nv12_shows_the_same_in_each_encoding() {
     let image = RgbaImage::from_fn(61, 47, |x, y| *blocks.get_pixel(x / 2, y / 2));
     let camera = Camera::from_hfov(61, 47, 1.2);
     let params = Rectification::new(&camera, &canonical(64, 53), 64, 53);
-    let expected = reference::rectify(&image, &params, 53, 64);
+    let expected = on_reference(&image, &params, 53, 64);
     let off = |written, read| {
         let (luma, chroma) = nv12(&image, written);
         let planes = Planes::Nv12 {
@@ -377,8 +477,8 @@ proptest! {
         let camera = Camera::from_hfov(upright.width(), upright.height(), 1.1);
         let plain = Rectification::new(&camera, &canonical(64, 53), 64, 53);
         let turned = Rectification { texels: Texels::new(crop, orientation), ..plain };
-        let expected = reference::rectify(&upright, &plain, 53, 64);
-        let on_cpu = reference::rectify(&stored, &turned, 53, 64);
+        let expected = on_reference(&upright, &plain, 53, 64);
+        let on_cpu = on_reference(&stored, &turned, 53, 64);
         prop_assert_eq!(&on_cpu, &expected);
         let found = difference(&on_gpu(&stored, &turned, 64, 53), expected.data()).unwrap();
         prop_assert!(found <= 2e-4, "{}", found);

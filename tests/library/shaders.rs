@@ -18,7 +18,7 @@ use Layout::{Buffer, HalfBuffer};
 
 /// What the library composes from the files in `shaders/`, and the constants that these want in their text:
 /// a file that nobody lists is not tested. Some have no layout: they bind their textures themselves, or draw.
-const KERNELS: [Kernel; 32] = [
+const KERNELS: [Kernel; 31] = [
     (&["back_project"], &Layout::ALL, &[]),
     (&["concat"], &Layout::ALL, &[]),
     (
@@ -111,24 +111,27 @@ const KERNELS: [Kernel; 32] = [
     (&["overlay_share", "overlay"], &Layout::ALL, &[]),
     (&["probe_arithmetic"], &[], &[]),
     (&["probe_copy"], &[], &[]),
-    (&["rectify", "rectify_storage"], &Layout::ALL, &[]),
-    (&["rectify", "rectify_texture"], &Layout::ALL, &[]),
-    (&["rectify", "rectify_srgb"], &Layout::ALL, &[]),
-    (&["rectify", "rectify_nv12"], &Layout::ALL, &[]),
+    (&["gaze", "rectify", "rectify_storage"], &Layout::ALL, &[]),
+    (&["gaze", "rectify", "rectify_texture"], &Layout::ALL, &[]),
+    (&["gaze", "rectify", "rectify_srgb"], &Layout::ALL, &[]),
+    (&["gaze", "rectify", "rectify_nv12"], &Layout::ALL, &[]),
     (&["render"], &[], &[]),
     (&["sigmoid"], &Layout::ALL, &[]),
     (&["soft_argmax2d"], &Layout::ALL, &[]),
     (&["unrectify"], &Layout::ALL, &[]),
     (&["upsample2d"], &Layout::ALL, &[]),
-    (&["overlay_share", "zoom_camera", "zoom"], &Layout::ALL, &[]),
     (
-        &["overlay_share", "zoom_camera", "zoom_overlay"],
+        &["overlay_share", "gaze", "zoom_camera", "zoom"],
         &Layout::ALL,
         &[],
     ),
-    (&["zoom_camera", "zoom_image"], &Layout::ALL, &[]),
-    (&["zoom_camera", "zoom_joints"], &Layout::ALL, &[]),
-    (&["zoom_camera", "zoom_mask"], &Layout::ALL, &[]),
+    (
+        &["overlay_share", "gaze", "zoom_camera", "zoom_overlay"],
+        &Layout::ALL,
+        &[],
+    ),
+    (&["gaze", "zoom_camera", "zoom_joints"], &Layout::ALL, &[]),
+    (&["gaze", "zoom_camera", "zoom_mask"], &Layout::ALL, &[]),
 ];
 
 type Kernel = (

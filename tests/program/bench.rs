@@ -338,7 +338,7 @@ fn a_plan_hands_out_its_steps_in_order_with_all_their_work() {
     labels.dedup();
     assert_eq!(labels[0], "rectify");
     let at = |label| labels.iter().position(|l| *l == label).unwrap();
-    assert_eq!(at("coarse.zoom_image") + 1, at("mask.conv1"));
+    assert_eq!(at("coarse.rectify") + 1, at("mask.conv1"));
     assert_eq!(at("mask.conv5") + 1, at("zoom_mask"));
     assert_eq!(labels[labels.len() - 2..], ["joint.dense", "coverage"]);
     assert_eq!(plan.steps(false).last().unwrap().label(), "coverage");

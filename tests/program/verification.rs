@@ -44,6 +44,7 @@ fn kernels() -> BTreeSet<String> {
         "conv2d_pooled",
         "conv2d_rows",
         "estimate_layout",
+        "gaze",
         "layout",
         "overlay_share",
         "probe_arithmetic",

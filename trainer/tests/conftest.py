@@ -57,6 +57,12 @@ def recording(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def held_out(tmp_path_factory):
+    """Of as many samples, to validate on."""
+    return _drawn(tmp_path_factory, 40)
+
+
+@pytest.fixture(scope="session")
 def small_recording(tmp_path_factory):
     """For tests of which each picture costs a network's time often."""
     return _drawn(tmp_path_factory, 12)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from whereabot_trainer import data
+from whereabot_trainer import data, zoom
 from whereabot_trainer.networks import INPUT_HEIGHT, INPUT_WIDTH
 
 
@@ -15,8 +15,12 @@ CAMERA = {"fx": 365, "fy": 365, "cx": 255.5, "cy": 211.5}
 
 
 def test_halve_is_the_mean_of_each_block():
-    pixels = np.array([[0, 1, 10, 10], [2, 4, 10, 14]], np.uint8)
-    assert data.halve(pixels).tolist() == [[2, 11]]
+    pixels = torch.tensor([[[0, 1, 10, 10], [2, 4, 10, 14]]], dtype=torch.uint8)
+    assert data.halve(pixels).tolist() == [[[2, 11]]]
+    assert data.halve(torch.full((2, 4, 6, 3), 255, dtype=torch.uint8)).tolist() == [[[[255] * 3] * 3] * 2] * 2
+    # A mask's pixel is robot where at least half of the block is.
+    masks = torch.tensor([[[255, 254, 255, 0], [0, 0, 255, 0]]], dtype=torch.uint8)
+    assert data.truth_of(masks).tolist() == [[[[0, 1]]]]
 
 
 def test_reads_a_recording_and_its_growth(recording, tmp_path):
@@ -201,6 +205,38 @@ def test_views_keep_image_and_mask_together():
     assert 0.1 < masks.mean() < 0.9
 
 
+class _Left(torch.nn.Module):
+    """Sees a robot left of the middle in any image."""
+
+    def forward(self, images):
+        mask = torch.zeros(len(images), 1, *images.shape[2:])
+        mask[:, :, 80:130, 60:110] = 1
+        return mask
+
+
+def test_closer_views_are_of_the_picture_s_own_pixels_where_the_coarse_network_looks():
+    torch.manual_seed(0)
+    height, width = 2 * INPUT_HEIGHT, 2 * INPUT_WIDTH
+    # Robot and background in columns of single pixels, but for a block where the coarse network looks.
+    masks = torch.zeros(6, height, width, dtype=torch.uint8)
+    masks[:, :, ::2] = 255
+    masks[:, 150:270, 110:230] = 255
+    images = masks[..., None].expand(-1, -1, -1, 3)
+    seen, truth = data.closer_views(images, masks, _Left(), False, share=0)
+    assert seen.shape == (6, 3, INPUT_HEIGHT, INPUT_WIDTH) and truth.shape == (6, 1, INPUT_HEIGHT, INPUT_WIDTH)
+    assert ((seen[:, :1] >= 0.5).float() == truth).all()
+    # It is in the middle, and twice as large as in the networks' own image, mirrored or not.
+    assert truth[:, 0, 60:150, 80:175].all() and truth.mean() < 0.9
+    # Columns that halving makes grey all over are told apart.
+    assert seen[:, 0, :20].std() > 0.2 and zoom.canonical(masks[:, None].float() / 255)[0, 0, :20].std() < 1e-6
+    # With cameras and light of their own, pictures and masks stay together.
+    masks = torch.zeros_like(masks)
+    masks[:, 150:270, 110:230] = 255
+    varied, truth = data.closer_views(masks[..., None].expand(-1, -1, -1, 3), masks, _Left(), False, share=1)
+    assert len({round(float(mask.mean()), 3) for mask in truth}) > 3
+    assert torch.corrcoef(torch.stack([varied[:, 0].flatten(), truth.flatten()]))[0, 1] > 0.7
+
+
 def test_crops_are_parts_of_the_image_as_they_are():
     torch.manual_seed(0)
     numbers = torch.arange(float(INPUT_HEIGHT * INPUT_WIDTH)).reshape(1, 1, INPUT_HEIGHT, INPUT_WIDTH)
@@ -230,8 +266,11 @@ def test_negatives_fill_the_input(tmp_path):
     Image.new("L", (30, 90), 7).save(tmp_path / "tall.jpg")
     for _ in range(2):
         photographs = data.read_negatives([tmp_path], tmp_path / "cache")
-        assert photographs.shape == (2, INPUT_HEIGHT, INPUT_WIDTH, 3)
+        assert photographs.shape == (2, 2 * INPUT_HEIGHT, 2 * INPUT_WIDTH, 3)
         assert photographs[1, 100, 100].tolist() == [10, 200, 30]
+    (tmp_path / "broken.jpg").write_bytes(b"GIF89a and no more")
+    with pytest.raises(data.RecordingError, match="broken.jpg: expected a photograph: cannot identify"):
+        data.read_negatives([tmp_path], tmp_path / "cache")
     with pytest.raises(data.RecordingError, match="no photographs"):
         data.read_negatives([tmp_path / "cache"], tmp_path / "cache")
 

@@ -138,14 +138,14 @@ def test_what_cannot_be_done_ends_in_one_line(tmp_path, command):
 
 
 @pytest.mark.parametrize("family", ["paper", "context"])
-def test_export_folds_calibration_and_unit(train, recording, tmp_path, monkeypatch, family):
+def test_export_folds_calibration_and_unit(train, recording, held_out, tmp_path, monkeypatch, family):
     # What a network of three batches is best at may be no shift at all.
     monkeypatch.setattr(evaluate, "calibrate", lambda *_: 0.7)
     mask_run = train("train-mask", "mask", "--iterations", "3", "--crop", "32", "24", "--validation-samples", "4")
     joint_run = train("train-joint", "joint", "--family", family, "--iterations", "3", "--pool", "4", "--validation-samples", "4",
                       "--mask-run", str(mask_run), "--estimated-masks", "0.5")
     path = tmp_path / "model.safetensors"
-    main(["export", "--mask", str(mask_run), "--joint", str(joint_run), "--validation", str(recording),
+    main(["export", "--mask", str(mask_run), "--joint", str(joint_run), "--validation", str(held_out),
           "--validation-samples", "10", "--cache", str(tmp_path / "cache"), "--out", str(path)])
     networks, description = read_model(path)
     mask, joint = networks["mask"], networks["joint"]
@@ -243,12 +243,12 @@ def test_calibration_finds_the_best_threshold():
             return torch.sigmoid(images[:, :1])
 
     class Made:
-        def pixels(self, numbers):
+        def pictures(self, numbers):
             mask = torch.zeros(len(numbers), 1, 10, 10)
             mask[..., :5] = 1
             image = torch.where(mask > 0, 3.0, 1.9)
             image[..., 0, 0] = 1.0
-            return image.expand(-1, 3, -1, -1), mask
+            return image.repeat_interleave(2, 2).repeat_interleave(2, 3).expand(-1, 3, -1, -1), mask
 
     assert evaluate.score_mask(Fixed(), Made(), [0, 1], "cpu")["iou"] == 0.5
     shift = evaluate.calibrate(Fixed(), Made(), [0, 1], "cpu")
@@ -306,14 +306,14 @@ def _same(network, other):
     return all(torch.equal(tensor, tensors[key]) for key, tensor in network.state_dict().items())
 
 
-def test_joints_are_trained_on_beside_a_model_file_s_mask_network(train, recording, tmp_path):
+def test_joints_are_trained_on_beside_a_model_file_s_mask_network(train, held_out, tmp_path):
     cache, first, second = ["--cache", str(tmp_path / "cache")], tmp_path / "a.safetensors", tmp_path / "b.safetensors"
     steps = ["--iterations", "2", "--validation-samples", "4"]
     mask_run = train("train-mask", "mask", *steps, "--crop", "32", "24")
     joint_run = train("train-joint", "joint", *steps)
 
     def export(mask, joint, out):
-        main(["export", "--mask", str(mask), "--joint", str(joint), "--validation", str(recording),
+        main(["export", "--mask", str(mask), "--joint", str(joint), "--validation", str(held_out),
               "--validation-samples", "10", "--out", str(out), *cache])
         return read_model(out)
 
@@ -341,9 +341,9 @@ def behind_coarse(monkeypatch):
     """Of each batch of masks that is made from here on, whether a coarse network turns the mask network's camera."""
     masks_of, seen = evaluate.masks_of, []
 
-    def spy(network, images, coarse=None, bf16=False):
+    def spy(network, pictures, coarse=None, bf16=False):
         seen.append(coarse is not None)
-        return masks_of(network, images, coarse, bf16)
+        return masks_of(network, pictures, coarse, bf16)
 
     monkeypatch.setattr(evaluate, "masks_of", spy)
     return seen
@@ -394,7 +394,7 @@ def test_a_model_file_is_exported_again_with_its_coarse_network_or_another(conte
             exported(*given)
 
 
-def test_both_masks_are_calibrated_the_mask_network_s_behind_the_coarse_one(context_runs, recording, tmp_path, monkeypatch):
+def test_both_masks_are_calibrated_the_mask_network_s_behind_the_coarse_one(context_runs, held_out, tmp_path, monkeypatch):
     coarse, mask, joint = context_runs
     given = []
 
@@ -403,7 +403,7 @@ def test_both_masks_are_calibrated_the_mask_network_s_behind_the_coarse_one(cont
         return -1.5
 
     monkeypatch.setattr(evaluate, "calibrate", calibrate)
-    main(["export", "--mask", str(mask), "--coarse", str(coarse), "--joint", str(joint), "--validation", str(recording),
+    main(["export", "--mask", str(mask), "--coarse", str(coarse), "--joint", str(joint), "--validation", str(held_out),
           "--validation-samples", "10", "--out", str(tmp_path / "out"), "--cache", str(tmp_path / "cache")])
     networks, description = read_model(tmp_path / "out")
     shift = load_network(coarse)[1]["figures"]["logit_shift"]
@@ -430,14 +430,37 @@ def test_a_coarse_network_goes_on_from_its_own_weights_and_begins_as_the_mask_ne
         train("train-mask", "paper", "--coarse", "--family", "paper")
 
 
+def test_a_mask_network_is_trained_on_what_its_camera_sees_and_scored_behind_it(context_runs, train, monkeypatch, behind_coarse):
+    coarse, mask, _ = context_runs
+    views, given = data.closer_views, []
+
+    def spy(images, masks, network, bf16):
+        given.append((tuple(images.shape[1:3]), network))
+        return views(images, masks, network, bf16)
+
+    monkeypatch.setattr(data, "closer_views", spy)
+    steps = ["--iterations", "2", "--validation-samples", "4", "--family", "context", "--init-from", str(mask)]
+    card = load_network(train("train-mask", "closer", *steps, "--coarse-run", str(coarse)))[1]["card"]
+    assert [size for size, _ in given] == [(424, 512)] * 2 and behind_coarse and all(behind_coarse)
+    last = load_network(coarse)[0].state_dict()["logit.bias"] + load_network(coarse)[1]["figures"]["logit_shift"]
+    assert torch.allclose(given[0][1].state_dict()["logit.bias"], last)
+    assert card["coarse_run"] == "coarse" and card["zoom"] == zoom.MASK_ZOOM and "crop" not in card
+    del given[:], behind_coarse[:]
+    train("train-mask", "alone", *steps, "--crop", "32", "24")
+    assert not given and not any(behind_coarse)
+    for flags in (["--coarse"], ["--camera", "fixed"]):
+        with pytest.raises(SystemExit, match="neither --coarse nor --camera fixed"):
+            train("train-mask", "neither", *steps, "--coarse-run", str(coarse), *flags)
+
+
 @pytest.mark.parametrize("flags", [[], ["--coarse-run"]])
 def test_joints_are_trained_behind_what_export_s_masks_will_be(context_runs, train, monkeypatch, flags):
     masks_of, seen = evaluate.masks_of, []
     coarse, mask, _ = context_runs
 
-    def spy(network, images, coarse=None, bf16=False):
+    def spy(network, pictures, coarse=None, bf16=False):
         seen.append((coarse is not None, bf16))
-        return masks_of(network, images, coarse, bf16)
+        return masks_of(network, pictures, coarse, bf16)
 
     monkeypatch.setattr(evaluate, "masks_of", spy)
     train("train-joint", "behind", "--iterations", "1", "--validation-samples", "4", "--mask-run", str(mask),
@@ -446,7 +469,7 @@ def test_joints_are_trained_behind_what_export_s_masks_will_be(context_runs, tra
     assert set(seen) == {(bool(flags), True), (bool(flags), False)}
 
 
-def test_several_runs_are_exported_as_the_mean_of_their_weights(train, recording, tmp_path):
+def test_several_runs_are_exported_as_the_mean_of_their_weights(train, held_out, tmp_path):
     steps = ["--iterations", "2", "--validation-samples", "4", "--family", "context"]
     runs = [train("train-joint", "first", *steps)]
     runs.append(train("train-joint", "second", *steps, "--init-from", str(runs[0])))
@@ -462,7 +485,7 @@ def test_several_runs_are_exported_as_the_mean_of_their_weights(train, recording
     masks = [train("train-mask", "first-mask", *steps, "--crop", "32", "24")]
     masks.append(train("train-mask", "second-mask", *steps, "--crop", "32", "24", "--init-from", str(masks[0])))
     out = tmp_path / "mean.safetensors"
-    main(["export", "--mask", *map(str, masks), "--joint", *map(str, runs), "--validation", str(recording), "--out", str(out),
+    main(["export", "--mask", *map(str, masks), "--joint", *map(str, runs), "--validation", str(held_out), "--out", str(out),
           "--validation-samples", "10", "--cache", str(tmp_path / "cache")])
     networks, description = read_model(out)
     expected = export._mean_of(list(map(str, masks)))[0].state_dict()
@@ -540,7 +563,7 @@ def test_one_command_trains_two_robots_and_goes_on(small_recording, tmp_path, ca
     assert "--resume" not in capsys.readouterr().out
     before = (tmp_path / "out" / "mask" / "log.csv").read_text()
     main(command)
-    assert capsys.readouterr().out.count("--resume") == 5
+    assert capsys.readouterr().out.count("--resume") == 6
     assert (tmp_path / "out" / "mask" / "log.csv").read_text() == before
     with pytest.raises(SystemExit, match="is of ur10"):
         main([*command[:2], str(small_recording), "--validation", str(other), *command[4:]])
@@ -560,6 +583,12 @@ def test_no_recording_is_trained_and_validated_on(recording, tmp_path):
         with pytest.raises(SystemExit, match=f"{recording}: expected recordings of their own to validate on"):
             main([*words, str(other), str(same)])
     assert not (tmp_path / "out").exists()
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "settings.json").write_text(json.dumps({"recording": [str(recording)]}))
+    for runs in (["run", "none"], ["none", "run"]):
+        mask, joint = (str(tmp_path / run) for run in runs)
+        with pytest.raises(SystemExit, match=f"{recording}: expected recordings of their own to validate on"):
+            main(["export", "--mask", mask, "--joint", joint, "--validation", str(other), str(same), "--out", "out"])
     data.refuse_common([recording], [other])
     data.refuse_common([recording], None)
 
@@ -570,7 +599,7 @@ def test_a_small_validation_recording_is_chosen_on_and_reported_on_by_halves(rec
     args = SimpleNamespace(recording=[recording], validation=[other], family="context", negatives=None, minutes=1.0, seed=7,
                            cache="c", dtype="f16", out=str(tmp_path / "out"))
     commands = pipeline.steps(args)
-    assert [words[0] for words in commands] == ["train-mask", "train-mask", "train-joint", "export"]
+    assert [words[0] for words in commands] == ["train-mask", "train-mask", "train-mask", "train-joint", "export"]
     for words in commands:
         assert words[words.index("--validation-samples") + 1] == "20"
         assert words[words.index("--seed") + 1] == "7"
@@ -593,7 +622,7 @@ def test_what_robots_share_is_chosen_on_as_many_samples_of_each(recording, tmp_p
 
     monkeypatch.setattr(pipeline, "VALIDATION_SAMPLES", 15)
     own = [("train-joint", 15)] * 2
-    assert counts("context") == [("train-mask", 30), ("train-mask", 30), ("train-joint", 30), *own, *[("export", 30)] * 2]
+    assert counts("context") == [*[("train-mask", 30)] * 3, ("train-joint", 30), *own, *[("export", 30)] * 2]
     assert {count for _, count in counts("paper") + counts("context", ["ur10"])} == {15}
     # Half of the samples are reported on.
     monkeypatch.setattr(pipeline, "VALIDATION_SAMPLES", 35)

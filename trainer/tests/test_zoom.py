@@ -39,6 +39,28 @@ def test_joints_are_where_the_picture_shows_them():
     assert not torch.allclose(zoom.joints_of(moved, rotations, zooms + 0.1), joints, atol=1e-2)
 
 
+def test_what_a_camera_sees_of_own_pixels_is_what_it_sees_of_halved_ones_but_sharper():
+    torch.manual_seed(1)
+    rotations, zooms = zoom.turns(*torch.deg2rad(torch.empty(3, 3).uniform_(-8, 8))), torch.tensor([1.0, 1.4, 2.0])
+    smooth = torch.nn.functional.interpolate(torch.rand(3, 3, 8, 10), (2 * INPUT_HEIGHT, 2 * INPUT_WIDTH), mode="bicubic")
+    halved = zoom.canonical(smooth)
+    found, expected = zoom.rectify(smooth, rotations, zooms), zoom.see(halved, rotations, zooms)
+    # Within a picture: at its border, a sample's pixels are half as wide.
+    inside = zoom.see(torch.ones_like(halved), rotations, zooms) == 1
+    inside &= zoom.rectify(torch.ones_like(smooth), rotations, zooms) > 1 - 1e-5
+    assert inside.float().mean() > 0.7 and (found - expected)[inside].abs().max() < 0.02
+    # Another turn, another zoom, and it is not.
+    assert (zoom.rectify(smooth, rotations.mT, zooms) - expected)[inside].abs().max() > 0.2
+    assert (zoom.rectify(smooth, rotations, zooms * 1.1) - expected)[inside].abs().max() > 0.1
+    # The canonical camera's image is what halving makes.
+    still = torch.eye(3).expand(3, 3, 3), torch.ones(3)
+    pictures = torch.rand(3, 3, 2 * INPUT_HEIGHT, 2 * INPUT_WIDTH)
+    assert torch.allclose(zoom.rectify(pictures, *still), zoom.canonical(pictures), atol=1e-3)
+    # Zoomed in by two, each pixel is a picture's own.
+    ahead = torch.eye(3).expand(3, 3, 3), torch.full((3,), 2.0)
+    assert zoom.rectify(pictures, *ahead).std() > 1.3 * zoom.see(zoom.canonical(pictures), *ahead).std()
+
+
 def test_the_camera_looks_at_the_robot_at_a_size_of_its_own():
     masks = torch.zeros(3, 1, INPUT_HEIGHT, INPUT_WIDTH)
     masks[0, :, 40:80, 115:195] = 1
@@ -150,11 +172,11 @@ class _Bright(torch.nn.Module):
 
 def test_of_what_is_alike_everywhere_the_closer_mask_is_the_same():
     torch.manual_seed(0)
-    images = torch.rand(2, 3, INPUT_HEIGHT, INPUT_WIDTH)
-    images[0] = 0.5
-    images[1] -= 8
-    images[1, :, 60:100, 30:90] += 8
-    once, twice = (evaluate.masks_of(_Bright(), images, coarse) for coarse in (None, _Bright()))
+    pictures = torch.rand(2, 3, 2 * INPUT_HEIGHT, 2 * INPUT_WIDTH)
+    pictures[0] = 0.5
+    pictures[1] -= 8
+    pictures[1, :, 120:200, 60:180] += 8
+    once, twice = (evaluate.masks_of(_Bright(), pictures, coarse) for coarse in (None, _Bright()))
     assert torch.allclose(once[0], twice[0], atol=1e-4)
     # Where there is something, it is looked at.
     assert not torch.allclose(once[1], twice[1], atol=0.1)

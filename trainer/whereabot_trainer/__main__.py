@@ -48,7 +48,7 @@ def _training_flags(parser, *, minutes, batch, learning_rate, momentum, dilation
 
 
 def _machine_flags(parser):
-    parser.add_argument("--cache", default=".cache", metavar="DIR", help="folder for decoded, halved images (%(default)s)")
+    parser.add_argument("--cache", default=".cache", metavar="DIR", help="folder for decoded images (%(default)s)")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="of weights, split and order (%(default)s)")
     parser.add_argument("--threads", type=int, metavar="N", help="CPU threads (PyTorch's choice)")
 
@@ -88,7 +88,7 @@ def main(argv=None):
     command.add_argument("--out", required=True, metavar="DIR", help="folder for runs and model files; called again, it"
                          " goes on where it stopped")
     command.add_argument("--dtype", choices=("f32", "f16"), default="f16", help="of the tensors (%(default)s)")
-    command.add_argument("--cache", default=".cache", metavar="DIR", help="folder for decoded, halved images (%(default)s)")
+    command.add_argument("--cache", default=".cache", metavar="DIR", help="folder for decoded images (%(default)s)")
     command.add_argument("--seed", type=int, default=1, metavar="S", help="of weights and order (%(default)s)")
     command.set_defaults(run=lambda args: pipeline.run(args, main))
 
@@ -99,6 +99,8 @@ def main(argv=None):
                          help="the paper's network, or a wider one with skips that has no --dilations and no --kernel (%(default)s)")
     command.add_argument("--coarse", action="store_true",
                          help="train the context family's coarse network, which tells its mask network where to look")
+    command.add_argument("--coarse-run", metavar="RUN", help="finished run of train-mask --coarse, or a model file, by whose masks the"
+                         " network looks: it is trained on what it will see, without --crop and --zoom")
     command.add_argument("--kernel", type=int, default=3, metavar="K",
                          help="columns and rows of the paper's network's convolutions (%(default)s)")
     command.add_argument("--crop", nargs=2, type=int, default=(160, 128), metavar=("W", "H"),

@@ -1,4 +1,4 @@
-"""Recordings as training samples: reading, halving, caching, splitting and augmentation."""
+"""Recordings as training samples: reading, caching, halving, splitting and augmentation."""
 
 import hashlib
 import json
@@ -13,7 +13,8 @@ from filelock import FileLock
 from PIL import Image, ImageOps
 from tqdm import tqdm
 
-from .networks import CAMERA, INPUT_HEIGHT, INPUT_WIDTH, JOINTS
+from . import zoom
+from .networks import CAMERA, INPUT_HEIGHT, INPUT_WIDTH, JOINTS, run
 
 FORMAT, VERSION = "whereabot-recording", 1
 
@@ -100,10 +101,14 @@ def read_samples(folder):
 
 
 def halve(pixels):
-    """The mean of every 2x2 block, in the same integer type; pixels [H, W, ...]."""
-    height, width, *rest = pixels.shape
-    blocks = pixels.reshape(height // 2, 2, width // 2, 2, *rest).astype(np.uint16)
-    return ((blocks.sum((1, 3)) + 2) // 4).astype(pixels.dtype)
+    """The mean of every 2x2 block of uint8 [N, H, W, ...], in the same type."""
+    rows = pixels[:, ::2].short() + pixels[:, 1::2]
+    return ((rows[:, :, ::2] + rows[:, :, 1::2] + 2) // 4).byte()
+
+
+def truth_of(masks):
+    """The canonical camera's masks f32 [N, 1, H, W] of 0 and 1, of a recording's own, uint8 [N, 2 H, 2 W]: at least half of the block."""
+    return (halve(masks) >= 128)[:, None].float()
 
 
 def _decode(folder, number, sample):
@@ -118,11 +123,11 @@ def _decode(folder, number, sample):
                     f"{key}: expected {2 * INPUT_WIDTH}x{2 * INPUT_HEIGHT} pixels, found {shape[1]}x{shape[0]}")
     except (OSError, ValueError) as error:
         raise RecordingError(f"{folder / 'samples.jsonl'}: line {number}: {error}") from error
-    return halve(image), (halve(mask) >= 128).astype(np.uint8)
+    return image, mask
 
 
 def _cached_pixels(folder, samples, cache):
-    """(images [N, 212, 256, 3], masks [N, 212, 256] of 0 and 1) as memory maps; only new samples are decoded."""
+    """(images [N, 424, 512, 3], masks [N, 424, 512]) as memory maps; only new samples are decoded."""
     folder, cache = Path(folder).resolve(), Path(cache)
     cache.mkdir(parents=True, exist_ok=True)
     stem = f"{folder.name}-{hashlib.sha256(str(folder).encode()).hexdigest()[:8]}"
@@ -142,10 +147,12 @@ def _version(path):
 
 def _locked_pixels(folder, samples, cache, stem):
     index = cache / f"{stem}.json"
+    size = (2 * INPUT_HEIGHT, 2 * INPUT_WIDTH)
+    shapes = {"images": (*size, 3), "masks": size}
     files = [[_version(folder / sample[key]) for key in ("image", "mask")] for sample in samples]
 
     def digest(count):
-        return hashlib.sha256(json.dumps([samples[:count], files[:count]]).encode()).hexdigest()
+        return hashlib.sha256(json.dumps([samples[:count], files[:count], shapes]).encode()).hexdigest()
 
     done = 0
     try:
@@ -155,7 +162,6 @@ def _locked_pixels(folder, samples, cache, stem):
     except (OSError, ValueError, KeyError, TypeError):
         # All can be decoded again.
         pass
-    shapes = {"images": (INPUT_HEIGHT, INPUT_WIDTH, 3), "masks": (INPUT_HEIGHT, INPUT_WIDTH)}
     paths = {key: cache / f"{stem}.{key}.u8" for key in shapes}
     if done < len(samples):
         if not done:
@@ -194,7 +200,8 @@ class Samples:
             self.parts.append((images, masks))
             absent = np.full((len(JOINTS), 3), np.nan)
             joints += [sample.get("joints_m", absent) for sample in samples]
-            coverage.append(masks.mean((1, 2)))
+            # One at a time: a memory map's mean is of a copy of all.
+            coverage.append([(mask >= 128).mean() for mask in masks])
             ids += [sample["id"] for sample in samples]
             robots += [header["robot"]] * len(samples)
             self.sources.append({"name": Path(folder).name, "robot": header["robot"], "samples": len(samples),
@@ -217,44 +224,52 @@ class Samples:
         return ~np.isnan(self.joints[:, 0, 0])
 
     def pixels(self, numbers):
-        """(images [N, 3, H, W] in [0, 1], masks [N, 1, H, W] of 0 and 1) as f32 tensors."""
+        """(images [N, 3, H, W] in [0, 1], masks [N, 1, H, W] of 0 and 1) of the canonical camera, as f32 tensors."""
+        pictures, masks = self.pictures(numbers)
+        return zoom.canonical(pictures), masks
+
+    def pictures(self, numbers):
+        """(recordings' own pixels [N, 3, 2 H, 2 W] in [0, 1], the canonical camera's masks [N, 1, H, W] of 0 and 1) as f32 tensors."""
         images, masks = self.bytes(numbers)
-        return images.permute(0, 3, 1, 2).float() / 255, masks
+        return images.permute(0, 3, 1, 2).float() / 255, truth_of(masks)
 
     def keep(self, device):
-        """Holds all pixels in a GPU's memory from now on (217 KB a sample): on their way there, training would wait."""
+        """Holds all pixels in a GPU's memory from now on (868 KB a sample): on their way there, training would wait."""
         self._kept = [torch.cat([torch.from_numpy(np.array(part[kind])).to(device) for part in self.parts]) for kind in (0, 1)]
 
     def bytes(self, numbers):
-        """(images uint8 [N, H, W, 3], masks f32 [N, 1, H, W] of 0 and 1), where they are kept."""
+        """(images [N, 2 H, 2 W, 3], masks [N, 2 H, 2 W]) as they were recorded, uint8, where they are kept."""
         if self._kept is not None:
             images, masks = self._kept
             rows = torch.from_numpy(np.asarray(numbers)).to(images.device)
-            return images[rows], masks[rows][:, None].float()
-        images = np.empty((len(numbers), INPUT_HEIGHT, INPUT_WIDTH, 3), np.uint8)
-        masks = np.empty((len(numbers), INPUT_HEIGHT, INPUT_WIDTH), np.uint8)
-        for row, number in enumerate(numbers):
+            return images[rows], masks[rows]
+        found = []
+        for number in numbers:
             part = np.searchsorted(self._starts, number, "right") - 1
-            images[row] = self.parts[part][0][number - self._starts[part]]
-            masks[row] = self.parts[part][1][number - self._starts[part]]
-        return torch.from_numpy(images), torch.from_numpy(masks)[:, None].float()
+            found.append([pixels[number - self._starts[part]] for pixels in self.parts[part]])
+        images, masks = (torch.from_numpy(np.stack(pixels)) for pixels in zip(*found, strict=True))
+        return images, masks
 
 
 def read_negatives(folders, cache):
-    """Photographs without a robot as uint8 [N, 212, 256, 3], cut to fill the networks' input; decoded once."""
+    """Photographs without a robot as uint8 [N, 424, 512, 3], cut to fill a recording's picture; decoded once."""
     paths = sorted(path for folder in folders for path in Path(folder).resolve().iterdir()
                    if path.suffix.lower() in {".jpg", ".jpeg", ".png", ".webp"})
     if not paths:
         raise RecordingError(f"no photographs in {', '.join(map(str, folders))}")
-    files = json.dumps([[str(path), _version(path)] for path in paths])
+    size = (2 * INPUT_WIDTH, 2 * INPUT_HEIGHT)
+    files = json.dumps([size, [[str(path), _version(path)] for path in paths]])
     stored = Path(cache) / f"photographs-{hashlib.sha256(files.encode()).hexdigest()[:8]}.npy"
     stored.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(stored.with_suffix(".lock")):
         if not stored.exists():
             pictures = []
             for path in tqdm(paths, "decoding photographs", mininterval=5):
-                with Image.open(path) as file:
-                    pictures.append(np.asarray(ImageOps.fit(file.convert("RGB"), (INPUT_WIDTH, INPUT_HEIGHT))))
+                try:
+                    with Image.open(path) as file:
+                        pictures.append(np.asarray(ImageOps.fit(file.convert("RGB"), size)))
+                except (OSError, ValueError) as error:
+                    raise RecordingError(f"{path}: expected a photograph: {error}") from error
             partial = stored.with_suffix(".partial")
             with open(partial, "wb") as file:
                 np.save(file, np.stack(pictures))
@@ -337,6 +352,14 @@ def relight_robots(images, masks):
     return (images * (1 + masks * (gain - 1))).clamp_(max=1)
 
 
+def relight_some_robots(images, masks, share=VARIED):
+    """The same of a share of the images, in place."""
+    relit = torch.rand(len(images)) < share
+    if relit.any():
+        images[relit] = relight_robots(images[relit], masks[relit])
+    return images
+
+
 def jitter_some_colours(images, share=VARIED):
     """The same of a share of the images; the others as they are."""
     plain = images.permute(0, 3, 1, 2).float() / 255
@@ -398,10 +421,7 @@ def mixed_views(images, masks, height, width, zoom, share=VARIED):
     """What a free camera's mask network learns from: parts of height x width of the pictures, uint8 [N, H, W, 3], as they are, mirrored
     half of the time; of a share the colours vary, of one the light on the robot, of one the view. Of all, that would be another task than the one it is judged
     by: the pictures have lights, cameras and sizes of their own."""
-    plain = jitter_some_colours(images, share)
-    relit = torch.rand(len(images)) < share
-    if relit.any():
-        plain[relit] = relight_robots(plain[relit], masks[relit])
+    plain = relight_some_robots(jitter_some_colours(images, share), masks, share)
     moved = torch.rand(len(images)) < share
     parts, truth = random_crops(plain, masks, height, width)
     mirrored = torch.rand(len(images)) < 0.5
@@ -409,6 +429,23 @@ def mixed_views(images, masks, height, width, zoom, share=VARIED):
     if moved.any():
         parts[moved], truth[moved] = random_views(plain[moved], masks[moved], height, width, zoom=zoom)
     return parts, truth
+
+
+def closer_views(images, masks, coarse, bf16, share=VARIED):
+    """What a mask network behind a `coarse` one learns from: what its camera sees of the pictures, uint8 [N, 2 H, 2 W, 3] with their
+    masks [N, 2 H, 2 W], from their own pixels. Mirrored half of the time; of a share the colours vary, of one the light on the
+    robot, of one the camera."""
+    masks = masks[:, None].float() / 255
+    pictures = relight_some_robots(jitter_some_colours(images, share), masks, share)
+    with torch.no_grad():
+        cameras = zoom.look_at(run(coarse, zoom.canonical(pictures), bf16), zoom.MASK_ZOOM, zoom.LOOKED_AT)
+    varied = (torch.rand(len(images)) < share)[:, None, None]
+    others = zoom.vary(*cameras)
+    cameras = torch.where(varied, others[0], cameras[0]), torch.where(varied[:, 0, 0], others[1], cameras[1])
+    seen = zoom.rectify(torch.cat([pictures, masks], 1), *cameras)
+    mirrored = torch.rand(len(images)) < 0.5
+    seen[mirrored] = seen[mirrored].flip(3)
+    return seen[:, :3], (seen[:, 3:] >= 0.5).float()
 
 
 def random_crops(images, masks, height, width):

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from . import kinematic_fit, losses, zoom
-from .networks import CAMERA, JOINTS, overlay
+from .networks import CAMERA, JOINTS, overlay, run
 
 BATCH = 8
 # Bins of the mask's logit, for IoU at every threshold at once.
@@ -23,25 +23,22 @@ def shift_logits(network, shift):
 
 
 @torch.no_grad()
-def masks_of(network, images, coarse=None, bf16=False):
-    """The masks [N, 1, H, W] of `images`: the mask network's, which looks where the `coarse` network's mask turns it to if there is
-    one."""
-    def run(network, images):
-        with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
-            return network(images.contiguous(memory_format=torch.channels_last)).float()
-
+def masks_of(network, pictures, coarse=None, bf16=False):
+    """The canonical camera's masks [N, 1, H, W] of recordings' own pixels [N, 3, 2 H, 2 W]: the mask network's, which looks where the
+    `coarse` network's mask turns it to if there is one."""
+    images = zoom.canonical(pictures)
     if coarse is None:
-        return run(network, images)
-    mask = run(coarse, images)
+        return run(network, images, bf16)
+    mask = run(coarse, images, bf16)
     cameras = zoom.look_at(mask, zoom.MASK_ZOOM, zoom.LOOKED_AT)
-    return zoom.merge(mask, run(network, zoom.see(images, *cameras)), *cameras)
+    return zoom.merge(mask, run(network, zoom.rectify(pictures, *cameras), bf16), *cameras)
 
 
 def estimate_masks(network, samples, numbers, device, coarse=None):
     """The mask network's answer for each sample as {number: uint8 [H, W]}, 255 for certain; `coarse` as of `masks_of`."""
     answers = {}
     for batch in _batches(numbers):
-        estimate = masks_of(network, samples.pixels(batch)[0].to(device), coarse)
+        estimate = masks_of(network, samples.pictures(batch)[0].to(device), coarse)
         for number, mask in zip(batch, estimate, strict=True):
             answers[int(number)] = (mask[0] * 255).round().byte().cpu().numpy()
     return answers
@@ -53,8 +50,8 @@ def mask_histograms(network, samples, numbers, device, coarse=None):
     edges = torch.from_numpy(LOGIT_EDGES[1:-1]).to(device)
     histograms = []
     for batch in _batches(numbers):
-        images, masks = samples.pixels(batch)
-        logits = torch.logit(masks_of(network, images.to(device), coarse).double(), eps=1e-6)
+        pictures, masks = samples.pictures(batch)
+        logits = torch.logit(masks_of(network, pictures.to(device), coarse).double(), eps=1e-6)
         # A value on an edge is of the bin above.
         counted = torch.bucketize(logits, edges, right=True) + bins * (masks.to(device) < 0.5)
         histograms += [torch.bincount(each.flatten(), minlength=2 * bins).cpu().numpy() for each in counted]

@@ -47,6 +47,12 @@ def _model_file(paths):
     return paths[0]
 
 
+def _trained_on(paths):
+    """The recordings that the runs among `paths` were trained on; of model files, only names are known."""
+    settings = [Path(path) / "settings.json" for path in paths if path]
+    return [folder for file in settings if file.exists() for folder in json.loads(file.read_text())["recording"]]
+
+
 def _mean_of(runs):
     """(the network whose weights are the mean of the `runs`', the last one's checkpoint, what the card says of the mean). Of
     runs of which one started from the other, or all from the same, the mean often errs less than any (Wortsman et al., 2022)."""
@@ -66,6 +72,7 @@ def _mean_of(runs):
 
 def export_runs(args):
     """Folds calibration and standardisation into the weights, measures the cascade, and writes the model file."""
+    data.refuse_common(_trained_on([*args.mask, *args.joint, args.coarse]), args.validation)
     mask_file, joint_file = _model_file(args.mask), _model_file(args.joint)
     kept, kept_description = read_model(mask_file) if mask_file else ({}, {})
     mask, _, mask_mean = _mean_of(args.mask) if not mask_file else (kept["mask"], None, {})

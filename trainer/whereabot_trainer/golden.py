@@ -3,7 +3,8 @@
 `NAME.safetensors` is a complete model file. `NAME.activations.safetensors` holds, in f32 and without a batch
 dimension, the input `mask.image`, every layer's output as `mask.{layer}` and `joint.{layer}`, the joint network's
 input `joint.overlay`, and the cascade's result `joints` [18], in the canonical camera's frame. Where a coarse network turns the
-mask network's camera, the input is `coarse.image`, its layers `coarse.{layer}`, and the mask of both networks `merged`.
+mask network's camera, the input is `coarse.image`, made of the picture `source` of twice its size, its layers `coarse.{layer}`, and the
+mask of both networks `merged`.
 """
 
 from pathlib import Path
@@ -130,8 +131,9 @@ def _networks(seed, image, mask_layers, joint_layers):
 
 
 @torch.no_grad()
-def cascade_activations(networks, description, image):
-    """Every value of the cascade on one image [3, H, W], by `{network}.{layer}`."""
+def cascade_activations(networks, description, image, source=None):
+    """Every value of the cascade on one image [3, H, W], by `{network}.{layer}`; behind a coarse network, `image` is of the picture
+    `source` [3, 2 H, 2 W]."""
     def activations(name, image):
         return {f"{name}.{layer}": value[0] for layer, value in networks[name].activations(image).items()}
 
@@ -140,7 +142,8 @@ def cascade_activations(networks, description, image):
         values |= activations("coarse", image[None])
         coarse = values["coarse.mask"][None]
         cameras = zoom.look_at(coarse, description["coarse"]["zoom"], zoom.LOOKED_AT, camera)
-        values |= activations("mask", zoom.see(image[None], *cameras, camera))
+        values |= activations("mask", zoom.rectify(source[None], *cameras, camera))
+        values["source"] = source
         estimate = zoom.merge(coarse, values["mask.mask"][None], *cameras, camera)
         values["merged"] = estimate[0]
     else:
@@ -184,7 +187,12 @@ def write_golden(folder, seed=1):
         ("zoom", "context", heatmap, ramp, None, view, None, "f32"), ("arm", "paper", paper, multiply, None, None, ARM, "f32"),
         ("coarse", "context", heatmap, beside, closer, view, None, "f32"),
     ):
-        image = torch.rand((3, height, width), generator=torch.Generator().manual_seed(seed))
+        generator, source = torch.Generator().manual_seed(seed), None
+        if mask_zoom:
+            source = torch.randint(256, (3, 2 * height, 2 * width), generator=generator) / 255
+            image = zoom.canonical(source[None])[0]
+        else:
+            image = torch.rand((3, height, width), generator=generator)
         mask, joint = _networks(seed, image, mask_layers, joint_layers)
         networks = {"mask": mask, "joint": joint}
         if mask_zoom:
@@ -204,7 +212,7 @@ def write_golden(folder, seed=1):
             presence={"mask_threshold": 0.5, "sure_threshold": 0.7, "min_sure": 0.01}, card=CARD)
         path = folder / f"{name}.safetensors"
         write_model(path, networks, description, dtype)
-        values = cascade_activations(*read_model(path), image)
+        values = cascade_activations(*read_model(path), image, source)
         # Behind a coarse mask, nothing is told by a threshold.
         margin = 1.0 if mask_zoom else (values["mask.mask"] - 0.5).abs().min().item()
         if margin < 1e-3:

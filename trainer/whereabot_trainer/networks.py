@@ -317,3 +317,9 @@ def share(mask, rule):
 def overlay(image, mask, rule):
     """The joint network's input: colour [N, 3, H, W] as far as the mask [N, 1, H, W] lets it through."""
     return image * share(mask, rule)
+
+
+def run(network, images, bf16=False):
+    """A network's answer to `images`, as f32."""
+    with torch.autocast(images.device.type, torch.bfloat16, enabled=bf16):
+        return network(images.contiguous(memory_format=torch.channels_last)).float()

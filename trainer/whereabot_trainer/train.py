@@ -372,6 +372,13 @@ def train_mask(args):
         card |= {"init_from": Path(args.init_from).name}
     network = network.to(args.device, memory_format=torch.channels_last)
 
+    coarse = None
+    if args.coarse_run:
+        if args.coarse or args.camera == "fixed":
+            raise SystemExit("--coarse-run: expected neither --coarse nor --camera fixed")
+        coarse = load_coarse(args.coarse_run).to(args.device, memory_format=torch.channels_last)
+        card |= {"coarse_run": Path(args.coarse_run).name, "zoom": zoom.MASK_ZOOM}
+        del card["crop"]
     negatives = data.read_negatives(args.negatives, args.cache) if args.negatives else None
     if negatives is not None:
         card |= {"negatives": len(negatives), "negative_share": args.negative_share}
@@ -381,8 +388,11 @@ def train_mask(args):
         if negatives is not None:
             rows = torch.rand(len(batch), device="cpu") < args.negative_share
             drawn = torch.randint(len(negatives), (int(rows.sum()),), device="cpu")
-            images[rows], masks[rows] = torch.from_numpy(negatives[drawn.numpy()]).to(images.device), 0.0
+            images[rows], masks[rows] = torch.from_numpy(negatives[drawn.numpy()]).to(images.device), 0
         images, masks = images.to(args.device), masks.to(args.device)
+        if coarse is not None:
+            return data.closer_views(images, masks, coarse, args.precision == "bf16")
+        images, masks = data.halve(images), data.truth_of(masks)
         if args.camera == "fixed":
             return data.random_crops(data.jitter_some_colours(images), masks, height, width)
         share = data.COARSE_VARIED if args.coarse else data.VARIED
@@ -397,8 +407,8 @@ def train_mask(args):
     calibration = (held_out, validation) if args.validation else (samples, some)
 
     def score():
-        shift = evaluate.calibrate(network, *calibration, args.device)
-        return evaluate.score_mask(network, held_out, validation, args.device, shift) | {"logit_shift": shift}
+        shift = evaluate.calibrate(network, *calibration, args.device, coarse)
+        return evaluate.score_mask(network, held_out, validation, args.device, shift, coarse) | {"logit_shift": shift}
 
     fit(args, state, network, numbers, draw, batch_loss, score, card)
 
@@ -551,11 +561,11 @@ def train_joint(args):
 
     def draw(batch, progress):
         images, masks = samples.bytes(batch)
-        images, masks = images.to(args.device), masks.to(args.device)
-        images = data.jitter_some_colours(images)
+        pictures = data.jitter_some_colours(images.to(args.device))
+        images, masks = zoom.canonical(pictures), data.truth_of(masks.to(args.device))
         rows = torch.rand(len(batch)) < (args.estimated_masks if progress >= args.estimated_after else 0)
         if rows.any():
-            estimates = evaluate.masks_of(mask_network, images[rows], coarse, args.precision == "bf16")
+            estimates = evaluate.masks_of(mask_network, pictures[rows], coarse, args.precision == "bf16")
             moved = torch.rand(len(estimates)) < data.VARIED
             if moved.any():
                 estimates[moved] = data.jitter_masks(estimates[moved])

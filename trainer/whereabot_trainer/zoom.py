@@ -72,42 +72,65 @@ def turns(pan, tilt, roll):
     return about(0, 1, roll) @ about(1, 2, tilt) @ about(2, 0, pan)
 
 
+def canonical(pictures):
+    """The canonical camera's images [N, C, H, W] of recordings' own pixels [N, C, 2 H, 2 W]."""
+    return torch.nn.functional.avg_pool2d(pictures, 2)
+
+
+def rectify(pictures, rotations, zooms, camera=CAMERA):
+    """What the cameras see [N, C, H, W] of recordings' own pixels [N, C, 2 H, 2 W]: as the engine's `rectify`, the mean of 2 x 2
+    samples of a pixel's footprint, which is taken to be a parallelogram."""
+    height, width = (extent // 2 for extent in pictures.shape[2:])
+    k, ray = _pinhole((height, width), camera, pictures.device)
+
+    def places(x, y):
+        beside = ray + torch.tensor([x / camera["fx"], y / camera["fy"]], device=ray.device)
+        beside = torch.cat([beside / zooms[:, None, None], torch.ones(len(zooms), height * width, 1, device=ray.device)], 2)
+        return _places(beside @ (k @ rotations.mT).mT)
+
+    middle = places(0, 0)
+    across, along = places(0.5, 0) - places(-0.5, 0), places(0, 0.5) - places(0, -0.5)
+    return sum(_sample(pictures, middle + x * across + y * along, (height, width)) for x in (-0.25, 0.25) for y in (-0.25, 0.25)) / 4
+
+
 def see(images, rotations, zooms, camera=CAMERA):
     """What the cameras see of `images` [N, C, H, W] of the canonical camera: bilinear, zero beyond them."""
-    k, ray = _pinhole(images, camera)
+    k, ray = _pinhole(images.shape[2:], camera, images.device)
     ray = torch.cat([ray / zooms[:, None, None], torch.ones(len(images), ray.shape[1], 1, device=images.device)], 2)
-    return _sample(images, ray @ (k @ rotations.mT).mT)
+    return _sample(images, _places(ray @ (k @ rotations.mT).mT), images.shape[2:])
 
 
 def merge(coarse, closer, rotations, zooms, camera=CAMERA):
     """The canonical camera's masks [N, 1, H, W]: `closer`, which those cameras see, and beyond their view `coarse`. At a view's
     border, where a bilinear sample is partly beyond, they share."""
-    k, ray = _pinhole(coarse, camera)
+    k, ray = _pinhole(coarse.shape[2:], camera, coarse.device)
     turned = torch.cat([ray, torch.ones_like(ray[..., :1])], 2) @ rotations.mT
     seen = torch.cat([turned[..., :2] * zooms[:, None, None], turned[..., 2:]], 2)
-    closer, within = _sample(torch.cat([closer, torch.ones_like(closer)], 1), seen @ k.mT).split(1, 1)
+    both = torch.cat([closer, torch.ones_like(closer)], 1)
+    closer, within = _sample(both, _places(seen @ k.mT), coarse.shape[2:]).split(1, 1)
     return closer + (1 - within) * coarse
 
 
-def _pinhole(images, camera):
-    """(the camera's matrix, x / z and y / z of its pixels' rays [1, H W, 2])."""
-    height, width = images.shape[2:]
-    device = images.device
+def _pinhole(size, camera, device):
+    """(the camera's matrix, x / z and y / z of the rays [1, H W, 2] of the pixels of a `size` of (H, W))."""
     k = torch.tensor([[camera["fx"], 0, camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1]], device=device)
-    v, u = torch.meshgrid(torch.arange(float(height), device=device), torch.arange(float(width), device=device),
-                          indexing="ij")
+    v, u = torch.meshgrid(*(torch.arange(float(extent), device=device) for extent in size), indexing="ij")
     return k, torch.stack([(u - camera["cx"]) / camera["fx"], (v - camera["cy"]) / camera["fy"]], -1).reshape(1, -1, 2)
 
 
-def _sample(images, source):
-    """`images` [N, C, H, W] at as many places `source` [N, H W, 3], pixels in homogeneous coordinates."""
-    count, _, height, width = images.shape
+def _places(source):
+    """Pixels [N, H W, 2] of homogeneous coordinates [N, H W, 3]."""
     # Behind the camera it sees nothing; a pixel far away is none either.
     ahead = source[..., 2:] > 1e-3
-    source = torch.where(ahead, source[..., :2] / source[..., 2:].clamp(min=1e-3), -1e4)
+    return torch.where(ahead, source[..., :2] / source[..., 2:].clamp(min=1e-3), -1e4)
+
+
+def _sample(images, places, size):
+    """`images` [N, C, ...], of that `size` (H, W) or of more pixels that show the same, at as many of its `places` [N, H W, 2]."""
+    height, width = size
     # Pixel centres are whole numbers here; grid_sample's -1 and 1 are the image's outer edges.
-    grid = (2 * source + 1) / torch.tensor([width, height], device=images.device) - 1
-    return torch.nn.functional.grid_sample(images, grid.reshape(count, height, width, 2), align_corners=False)
+    grid = (2 * places + 1) / torch.tensor([width, height], device=images.device) - 1
+    return torch.nn.functional.grid_sample(images, grid.reshape(len(images), height, width, 2), align_corners=False)
 
 
 def joints_seen(joints, rotations, zooms):
