@@ -21,8 +21,9 @@ use crate::live::mcap::{RecordedCamera, Recorder};
 use crate::live::page::{self, CameraInfo};
 use crate::live::warning::{Warnings, uncertainty_m};
 use crate::live::{
-    Calibration, CameraConfig, Config, CpuEngine, Engine, Fusion, GpuEngine, GpuOptions,
-    KnownModel, Lines, Location, Named, NamedRig, Sink, Stop, Word, watch,
+    Calibration, CameraConfig, Config, CpuEngine, Engine, Event, EventKind, Fusion, GpuEngine,
+    GpuOptions, KnownModel, Lines, Location, Named, NamedRig, Observation, Sink, Statistics, Stop,
+    Word, watch,
 };
 use crate::network::{Description, Model};
 
@@ -30,9 +31,10 @@ use crate::network::{Description, Model};
 ///
 /// Writes JSON Lines: a result a camera a frame, events (a camera is live, stale, failed, ended; the GPU is lost, back),
 /// and once a second statistics. Always the newest frame of each camera is searched; older ones are dropped and
-/// counted. A camera that fails is opened again and delays no other. Stops with Ctrl-C, SIGTERM, or when all
+/// counted. A camera that fails is opened again and delays no other. Stops with Ctrl-C, SIGTERM, its terminal, or when all
 /// sources came to their end. Videos, streams and webcams are read by ffmpeg (5.1 or newer), which must be on the
-/// PATH. Exits with 0; with 1 if it could not start, or could not write what it found; with 2 on wrong usage.
+/// PATH. Exits with 0; with 1 if it could not start, could not write what it
+/// found, or a file could not be read to its end; with 2 on wrong usage.
 #[derive(Debug, clap::Args)]
 pub struct Args {
     /// The cameras (see docs/watch.md)
@@ -93,23 +95,41 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
     stop_on_signals(&stop).context("signals cannot be handled")?;
     // Last: they make files, and do what warnings ask for.
     let (say, words) = mpsc::channel();
-    let unwritten = Arc::new(AtomicBool::new(false));
-    let mut sinks = sinks(&args, &config, &models, &say, &stop, &unwritten)?;
+    let failed = Arc::new(AtomicBool::new(false));
+    let mut sinks = sinks(&args, &config, &models, &say, &stop, &failed)?;
     sinks.extend(page.iter().map(|page| Box::new(page.sink()) as _));
     let inputs = cameras.iter().map(CameraConfig::input).collect();
     let errors = watch(inputs, engine, sinks, words, &stop);
     errors.iter().for_each(|error| log::error!("{error}"));
-    Ok(if errors.is_empty() && !unwritten.load(Ordering::Relaxed) {
+    Ok(if errors.is_empty() && !failed.load(Ordering::Relaxed) {
         ExitCode::SUCCESS
     } else {
         ExitCode::FAILURE
     })
 }
 
-/// Sets `stop` on Ctrl-C and SIGTERM.
+/// SIGHUP, unless it is ignored, as after `nohup`: a handler would undo that. Where nothing tells, it stays as it is.
+#[cfg(unix)]
+fn hang_up() -> Option<i32> {
+    use signal_hook::consts::SIGHUP;
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let ignored = status
+        .lines()
+        .find_map(|line| line.strip_prefix("SigIgn:"))?;
+    let ignored = u64::from_str_radix(ignored.trim(), 16).ok()?;
+    (ignored >> (SIGHUP - 1) & 1 == 0).then_some(SIGHUP)
+}
+
+/// There is none.
+#[cfg(not(unix))]
+fn hang_up() -> Option<i32> {
+    None
+}
+
+/// Sets `stop` on Ctrl-C, on SIGTERM, and when the terminal closes.
 fn stop_on_signals(stop: &Arc<Stop>) -> io::Result<()> {
     let signalled = Arc::new(AtomicBool::new(false));
-    for signal in [SIGINT, SIGTERM] {
+    for signal in [SIGINT, SIGTERM].into_iter().chain(hang_up()) {
         signal_hook::flag::register(signal, Arc::clone(&signalled))?;
     }
     let stop = Arc::clone(stop);
@@ -124,21 +144,37 @@ fn stop_on_signals(stop: &Arc<Stop>) -> io::Result<()> {
     Ok(())
 }
 
-/// Where results go. `unwritten` is set where stdout took no more, but its reader did not leave.
+/// Where a camera's failure is kept that is its last.
+struct Failures(Arc<AtomicBool>);
+
+impl Sink for Failures {
+    fn observation(&mut self, _: &Observation) {}
+
+    fn statistics(&mut self, _: &Statistics) {}
+
+    fn event(&mut self, event: &Event) {
+        if let EventKind::Failed { retry_in: None, .. } = event.kind {
+            self.0.store(true, Ordering::Relaxed);
+        }
+    }
+}
+
+/// Where results go. `failed` is set where stdout took no more, but its reader did not leave, and where a camera failed
+/// that is not tried again.
 fn sinks(
     args: &Args,
     config: &Config,
     models: &Models,
     say: &Sender<Word>,
     stop: &Arc<Stop>,
-    unwritten: &Arc<AtomicBool>,
+    failed: &Arc<AtomicBool>,
 ) -> anyhow::Result<Vec<Box<dyn Sink>>> {
     let cameras = &config.cameras;
     let named = cameras.iter().map(|camera| Named {
         camera: camera.name.clone(),
         robot: models.robot(camera.robot.place).to_owned(),
     });
-    let (closed, unwritten) = (Arc::clone(stop), Arc::clone(unwritten));
+    let (closed, unwritten) = (Arc::clone(stop), Arc::clone(failed));
     let lines = Lines::new(named.collect(), io::stdout(), move |error| {
         if error.kind() != io::ErrorKind::BrokenPipe {
             log::error!("stdout: {error}");
@@ -157,7 +193,8 @@ fn sinks(
         }
     });
     let lines = lines.with_rigs(rigs.collect());
-    let mut sinks: Vec<Box<dyn Sink>> = vec![Box::new(lines)];
+    let failures = Failures(Arc::clone(failed));
+    let mut sinks: Vec<Box<dyn Sink>> = vec![Box::new(lines), Box::new(failures)];
     for (number, rig) in config.rigs.iter().enumerate() {
         let say = say.clone();
         let fused = move |fused| drop(say.send(Word::Fused(fused)));

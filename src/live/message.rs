@@ -12,7 +12,8 @@ pub(super) enum Message {
     Failed {
         camera: usize,
         reason: String,
-        retry_in: Duration,
+        /// `None` where it is not tried again.
+        retry_in: Option<Duration>,
     },
     /// The engine does not take a camera's frames.
     Refused { camera: usize, reason: String },

@@ -33,12 +33,19 @@ struct Memory {
 }
 
 impl Reader {
-    /// Until the source ends or everything is to stop. A source that fails is opened again.
+    /// Until the source ends or everything is to stop. A source that fails is opened again, unless it would begin again.
     pub fn run(mut self) {
         let mut memory = Memory::default();
         let mut patience = Patience::default();
         while let Err(error) = self.guarded_read(&mut memory, &mut patience) {
-            if self.stop.is_set() || self.wait(&error, &mut patience) {
+            if self.stop.is_set() {
+                break;
+            }
+            if self.input.source.ends() {
+                self.fail(&error, None);
+                break;
+            }
+            if self.wait(&error, &mut patience) {
                 break;
             }
         }
@@ -142,12 +149,16 @@ impl Reader {
     /// Tells what went wrong and waits: whether everything is to stop.
     fn wait(&self, error: &SourceError, patience: &mut Patience) -> bool {
         let retry_in = patience.next();
+        self.fail(error, Some(retry_in));
+        self.stop.wait(retry_in)
+    }
+
+    fn fail(&self, error: &SourceError, retry_in: Option<Duration>) {
         self.tell(Message::Failed {
             camera: self.camera,
             reason: error.to_string(),
             retry_in,
         });
-        self.stop.wait(retry_in)
     }
 
     fn tell(&self, message: Message) {

@@ -154,7 +154,6 @@ impl Desk {
                 retry_in,
             } => {
                 self.silence(camera);
-                let retry_in = Some(retry_in);
                 self.event(Some(camera), EventKind::Failed { reason, retry_in });
             }
             Message::Refused { camera, reason } => {

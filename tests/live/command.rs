@@ -55,7 +55,7 @@ fn lines_say_what_was_found_and_when() {
 
 #[test]
 fn signals_end_it_in_time_with_a_whole_line() {
-    for signal in ["INT", "TERM"] {
+    for signal in ["INT", "TERM", "HUP"] {
         let config = PHOTOS.to_owned()
             + "repeat = true\n"
             + "[[camera]]\nname = \"video\"\nsource = \"clip.mkv\"\nweights = \"model.safetensors\"\nhfov = 70\n";
@@ -70,6 +70,53 @@ fn signals_end_it_in_time_with_a_whole_line() {
         assert_eq!(status.code(), Some(0), "{signal}");
         println!("SIG{signal}: ended after {took:?}");
         assert!(took < Duration::from_secs(2), "SIG{signal}: {took:?}");
+    }
+}
+
+#[test]
+fn a_closed_terminal_does_not_end_what_is_to_outlive_it() {
+    let folder = folder(&(PHOTOS.to_owned() + "repeat = true\n"));
+    sources::folder(&folder.path().join("photos"), 5);
+    let watch = command(folder.path());
+    let mut outlives = std::process::Command::new("nohup");
+    outlives.arg(watch.get_program()).args(watch.get_args());
+    outlives.current_dir(folder.path());
+    outlives.args(["--adapter", "cpu", "cameras.toml"]);
+    let mut program = Program::start(outlives);
+    program.wait_for_result("left");
+    program.signal("HUP");
+    let seen = program.seen.len();
+    program.wait_for("more results", |_| true);
+    while program.seen.len() < seen + 20 {
+        program.wait_for_result("left");
+    }
+    program.signal("TERM");
+    assert_eq!(program.end().0.code(), Some(0));
+}
+
+#[test]
+fn a_file_that_is_cut_off_ends_as_a_failure() {
+    let config = "[[camera]]\nname = \"video\"\nsource = \"clip.mkv\"\nweights = \"model.safetensors\"\nhfov = 70\n";
+    let folder = folder(config);
+    let clip = folder.path().join("clip.mkv");
+    for broken in [false, true] {
+        sources::video(&clip, 1);
+        if broken {
+            std::fs::write(&clip, b"nothing that ffmpeg knows").unwrap();
+        }
+        let mut program = watch(folder.path(), None);
+        let (status, _) = program.end();
+        assert_eq!(status.code(), Some(i32::from(broken)));
+        let events = program.seen.iter().filter(|line| line["type"] == "event");
+        let events: Vec<_> = events.map(|line| line["event"].as_str().unwrap()).collect();
+        let expected = if broken { "failed" } else { "live" };
+        assert!(
+            events.contains(&expected) && events.last() == Some(&"ended"),
+            "{events:?}"
+        );
+        let failed = program.seen.iter().find(|line| line["event"] == "failed");
+        assert_eq!(failed.is_some(), broken);
+        assert!(failed.is_none_or(|line| line["retry_in_s"].is_null()));
     }
 }
 

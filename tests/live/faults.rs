@@ -9,8 +9,13 @@ use super::sources;
 
 /// A camera that `ffmpeg` reads, and one of pictures beside it.
 fn config(source: &str) -> String {
+    let repeat = if source.contains("://") {
+        ""
+    } else {
+        "repeat = true\n"
+    };
     format!(
-        "[[camera]]\nname = \"video\"\nsource = \"{source}\"\nweights = \"model.safetensors\"\nhfov = 70\n\
+        "[[camera]]\nname = \"video\"\nsource = \"{source}\"\nweights = \"model.safetensors\"\nhfov = 70\n{repeat}\
          [[camera]]\nname = \"photos\"\nsource = \"photos\"\nweights = \"model.safetensors\"\nhfov = 70\n\
          fps = 20\nrepeat = true\n"
     )

@@ -89,6 +89,10 @@ impl Ffmpeg {
 }
 
 impl Source for Ffmpeg {
+    fn ends(&self) -> bool {
+        self.location.ends() && !self.repeat
+    }
+
     fn open(&mut self, stop: &Arc<Stop>) -> Result<Box<dyn Stream>, SourceError> {
         // An address may hold a password.
         let secret = match &self.location {

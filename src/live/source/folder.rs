@@ -24,6 +24,10 @@ struct Pictures {
 }
 
 impl Source for Folder {
+    fn ends(&self) -> bool {
+        !self.repeat
+    }
+
     fn open(&mut self, stop: &Arc<Stop>) -> Result<Box<dyn Stream>, SourceError> {
         Ok(Box::new(Pictures {
             paths: images(&self.path)?,

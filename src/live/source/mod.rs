@@ -21,13 +21,18 @@ use super::Stop;
 use crate::camera::{Camera, CameraError};
 use crate::recording::RecordingError;
 
-/// What gives a camera's frames. It is opened again after it failed.
+/// What gives a camera's frames. It is opened again after it failed, unless it has an end.
 pub trait Source: Send {
     /// Opens it. Whoever waits for a frame of it returns soon after `stop` is set.
     ///
     /// # Errors
     /// What keeps it from being opened now; it may be tried again.
     fn open(&mut self, stop: &Arc<Stop>) -> Result<Box<dyn Stream>, SourceError>;
+
+    /// Whether it is of a length of its own, as a file is. Opened again, it would begin again.
+    fn ends(&self) -> bool {
+        false
+    }
 }
 
 /// A source that is open; dropped, it is closed.

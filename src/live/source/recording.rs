@@ -26,6 +26,10 @@ struct Samples {
 }
 
 impl Source for Recording {
+    fn ends(&self) -> bool {
+        !self.repeat
+    }
+
     fn open(&mut self, stop: &Arc<Stop>) -> Result<Box<dyn Stream>, SourceError> {
         Ok(Box::new(Samples {
             reader: Reader::open(&self.path)?,
