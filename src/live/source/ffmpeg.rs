@@ -26,6 +26,10 @@ struct Frames {
 }
 
 impl Ffmpeg {
+    /// How long a server may be silent before `ffmpeg` ends by itself, in microseconds: longer than it takes us to end it, for when
+    /// we were killed.
+    const SILENCE_US: &str = "60000000";
+
     pub fn new(location: Location, fps: Option<f64>, repeat: bool) -> Self {
         Self {
             location,
@@ -66,6 +70,9 @@ impl Ffmpeg {
                 if address.starts_with("rtsp") {
                     // Over UDP, a lost packet spoils a picture.
                     command.args(["-rtsp_transport", "tcp"]);
+                    command.args(["-timeout", Self::SILENCE_US]);
+                } else if address.starts_with("http") {
+                    command.args(["-rw_timeout", Self::SILENCE_US]);
                 }
                 command.args(["-i", address]);
             }
