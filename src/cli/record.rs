@@ -150,7 +150,8 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
     if requests.len() > 1 {
         // What is wrong with the last robot shall not be told after hours.
         for request in requests.iter().step_by(3) {
-            Robot::load(&request.urdf, &request.packages)?;
+            let robot = Robot::load(&request.urdf, &request.packages)?;
+            recorder::check_robot(request, &robot)?;
         }
     }
     let device = Device::open(&AdapterRequest::new(None, None))?;

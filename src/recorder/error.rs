@@ -11,6 +11,22 @@ pub enum RecorderError {
     /// The robot's description cannot be used.
     #[error(transparent)]
     Robot(#[from] RobotError),
+    /// The description is of another robot than the name that the recording is to carry.
+    #[error(
+        "{}: expected the arm of a {robot}, {expected:.2} m from shoulder to elbow to wrist, found {}",
+        urdf.display(),
+        found.map_or("none of six joints".to_owned(), |found| format!("one of {found:.2} m"))
+    )]
+    OtherRobot {
+        /// The description.
+        urdf: PathBuf,
+        /// The name.
+        robot: String,
+        /// How long its arm is, in metres.
+        expected: f64,
+        /// How long the description's is; `None` where it has not six joints.
+        found: Option<f64>,
+    },
     /// What is in the output folder cannot be continued, or not be written.
     #[error(transparent)]
     Recording(#[from] RecordingError),

@@ -32,6 +32,7 @@ pub use stage::{Posed, Shot, Stage, Station};
 use crate::camera::Intrinsics;
 use crate::gpu::Device;
 use crate::recording::{self, Header, Protocol, Sample, Source, SourceKind, Writer};
+use crate::robot::Robot;
 
 /// Width of recorded images, pixels.
 pub const WIDTH: u32 = 512;
@@ -111,6 +112,38 @@ pub fn paper_requests(
         .collect()
 }
 
+/// Shoulder to elbow to wrist, in metres, by the names that users know: a UR3's, UR5's and UR10's, and an e-series' as long, within
+/// [`ARM_TOLERANCE`].
+const ARMS: [(&str, f64); 3] = [("ur3", 0.47), ("ur5", 0.83), ("ur10", 1.2)];
+/// How much of it an arm may be longer or shorter. URDFs place the elbow's frame on one side of it or the other.
+const ARM_TOLERANCE: f64 = 0.1;
+
+/// Whether `robot` can be the one that the request names. Of a name that is not one of [`PAPER`]'s, nothing is known.
+///
+/// # Errors
+/// [`RecorderError::OtherRobot`].
+pub fn check_robot(request: &Request, robot: &Robot) -> Result<(), RecorderError> {
+    let Some((_, expected)) = ARMS.iter().find(|(name, _)| *name == request.robot) else {
+        return Ok(());
+    };
+    let origins = robot.joint_origins(&robot.link_poses(&vec![0.0; robot.joints.len()]));
+    let found = match origins.as_slice() {
+        [_, shoulder, elbow, wrist, _, _] => {
+            Some(shoulder.distance(*elbow) + elbow.distance(*wrist))
+        }
+        _ => None,
+    };
+    if found.is_some_and(|found| (found / expected - 1.0).abs() <= ARM_TOLERANCE) {
+        return Ok(());
+    }
+    Err(RecorderError::OtherRobot {
+        urdf: request.urdf.clone(),
+        robot: request.robot.clone(),
+        expected: *expected,
+        found,
+    })
+}
+
 /// Renders a recording; goes on with one that was cut off. `progress` hears how many samples are done.
 ///
 /// # Errors
@@ -123,6 +156,7 @@ pub fn record(
 ) -> Result<(), RecorderError> {
     let backgrounds = Backgrounds::open(&request.backgrounds)?;
     let stage = Stage::load(&request.urdf, &request.packages, &request.bodies)?;
+    check_robot(request, stage.robot())?;
     let recordings: Vec<(PathBuf, Header)> = if request.cameras > 1 {
         let folder = |camera| request.out.join(format!("camera_{camera}"));
         (1..=request.cameras)

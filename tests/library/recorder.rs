@@ -10,7 +10,8 @@ use rand_chacha::ChaCha8Rng;
 use tempfile::TempDir;
 use whereabot::recorder::{
     CollisionModel, Effects, HEIGHT, INTRINSICS, Item, Kind, Lamp, Lighting, Material, Picture,
-    RecorderError, Renderer, Request, Scene, Shot, Stage, WIDTH, Window, paper_requests, record,
+    RecorderError, Renderer, Request, Scene, Shot, Stage, WIDTH, Window, check_robot,
+    paper_requests, record,
 };
 use whereabot::recording::{Header, Protocol, Reader, Sample, Writer};
 use whereabot::robot::{Frames, Mesh, Robot, RobotError};
@@ -663,6 +664,54 @@ fn samples(out: &Path) -> Vec<Sample> {
 
 fn image_of(out: &Path, name: &str) -> image::DynamicImage {
     image::open(out.join(name)).unwrap()
+}
+
+#[test]
+fn a_urdf_is_of_the_robot_that_it_is_said_to_be() {
+    let folder = TempDir::new().unwrap();
+    let urdf = folder.path().join("arm.urdf");
+    let origins = |upper: f64, fore: f64| {
+        [0.0, 0.1, upper, fore, 0.1, 0.1].map(|z| format!("<origin xyz=\"0 0 {z}\"/>"))
+    };
+    let write = |origins: &[String]| {
+        let mut text = String::from("<robot name=\"arm\"><link name=\"l0\"/>");
+        for (i, origin) in origins.iter().enumerate() {
+            text += &format!(
+                "<link name=\"l{0}\"/><joint name=\"j{0}\" type=\"revolute\"><parent link=\"l{i}\"/><child \
+                 link=\"l{0}\"/>{origin}<axis xyz=\"0 1 0\"/><limit lower=\"-3\" upper=\"3\" effort=\"1\" \
+                 velocity=\"1\"/></joint>",
+                i + 1
+            );
+        }
+        fs::write(&urdf, text + "</robot>").unwrap();
+        Robot::kinematics(&urdf).unwrap()
+    };
+    let check = |name: &str, robot: &Robot| {
+        let request = Request {
+            urdf: urdf.clone(),
+            robot: name.into(),
+            ..request(folder.path(), "out")
+        };
+        check_robot(&request, robot).map_err(|error| error.to_string())
+    };
+    for (name, upper, fore) in [
+        ("ur3", 0.24365, 0.21325),
+        ("ur5", 0.425, 0.39225),
+        ("ur10", 0.6127, 0.57155),
+    ] {
+        let robot = write(&origins(upper, fore));
+        assert_eq!(check(name, &robot), Ok(()));
+        assert_eq!(check("mine", &robot), Ok(()));
+        for (other, _) in whereabot::recorder::PAPER {
+            assert_eq!(check(other, &robot).is_ok(), other == name);
+        }
+    }
+    let said = check("ur10", &write(&origins(0.425, 0.39225))).unwrap_err();
+    let expected =
+        "expected the arm of a ur10, 1.20 m from shoulder to elbow to wrist, found one of 0.82 m";
+    assert!(said.contains(expected), "{said}");
+    let said = check("ur5", &write(&origins(0.425, 0.39225)[..3])).unwrap_err();
+    assert!(said.ends_with("found none of six joints"), "{said}");
 }
 
 #[test]
