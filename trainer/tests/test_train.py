@@ -498,6 +498,14 @@ def test_several_runs_are_exported_as_the_mean_of_their_weights(train, held_out,
     assert [each["iterations"] for each in card["mask_training"]["mean_of"]] == [2, 2]
     with pytest.raises(SystemExit, match="folder of a run"):
         export._mean_of([str(masks[0]), str(out)])
+    # The model file that a run started from is one of them.
+    again = tmp_path / "again.safetensors"
+    main(["export", "--mask", str(out), str(masks[1]), "--joint", str(out), "--validation", str(held_out), "--out", str(again),
+          "--validation-samples", "10", "--cache", str(tmp_path / "cache")])
+    half, before, last = (tensors["conv1.weight"] for tensors in (
+        read_model(again)[0]["mask"].state_dict(), expected, load_network(masks[1])[0].state_dict()))
+    assert torch.allclose(half, (before + last) / 2, atol=1e-6) and not torch.allclose(half, last)
+    assert [list(each)[0] for each in read_model(again)[1]["card"]["mask_training"]["mean_of"]] == ["file", "run"]
 
 
 @pytest.mark.parametrize("layers", [paper_mask_layers(), context_mask_layers(), coarse_mask_layers()])

@@ -137,7 +137,8 @@ def main(argv=None):
 
     command = commands.add_parser("export", help="write the networks as a model file")
     command.add_argument("--mask", required=True, nargs="+", metavar="RUN", help="run of train-mask, or a model file whose mask"
-                         " network stays; of several runs that started from each other, the mean of their weights")
+                         " network stays; of several runs that started from each other, the mean of their weights, the first of which may be the"
+                         " model file that they started from")
     command.add_argument("--coarse", metavar="RUN", help="run of train-mask --coarse, or a model file, by whose masks the mask network"
                          " looks (without: as its model file has it)")
     command.add_argument("--joint", required=True, nargs="+", metavar="RUN", help="run of train-joint, or a model file likewise; of several runs,"

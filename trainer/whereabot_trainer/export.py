@@ -53,21 +53,25 @@ def _trained_on(paths):
     return [folder for file in settings if file.exists() for folder in json.loads(file.read_text())["recording"]]
 
 
-def _mean_of(runs):
+def _mean_of(runs, masks_of=None):
     """(the network whose weights are the mean of the `runs`', the last one's checkpoint, what the card says of the mean). Of
-    runs of which one started from the other, or all from the same, the mean often errs less than any (Wortsman et al., 2022)."""
+    runs of which one started from the other, or all from the same, the mean often errs less than any (Wortsman et al., 2022).
+    The mask network that all started from may be among them, as the model file `masks_of`: it counts as one."""
     for run in runs:
         if not Path(run).is_dir():
             raise SystemExit(f"expected the folder of a run, found {run}")
     networks, states = zip(*(load_network(run) for run in runs), strict=True)
-    network, others = networks[-1], [each.state_dict() for each in networks]
-    kinds = {json.dumps([state["layers"], state["card"].get("mean"), state["card"].get("deviation")]) for state in states}
-    if len(kinds) > 1:
-        raise SystemExit(f"expected runs of one network in one unit, found {' and '.join(runs)}")
-    network.load_state_dict({key: torch.stack([other[key] for other in others]).mean(0) for key in others[0]})
+    kinds = [[state["layers"], state["card"].get("mean"), state["card"].get("deviation")] for state in states]
     of = [{"run": Path(run).name, "minutes": round(state["seconds"] / 60, 1), "iterations": state["iteration"]}
           for run, state in zip(runs, states, strict=True)]
-    return network, states[-1], {"mean_of": of} if len(runs) > 1 else {}
+    if masks_of:
+        networks = (read_model(masks_of)[0]["mask"], *networks)
+        kinds, of = [[networks[0].layers, None, None], *kinds], [{"file": Path(masks_of).name}, *of]
+    if len({json.dumps(kind, sort_keys=True) for kind in kinds}) > 1:
+        raise SystemExit(f"expected runs of one network in one unit, found {' and '.join([*filter(None, [masks_of]), *runs])}")
+    network, others = networks[-1], [each.state_dict() for each in networks]
+    network.load_state_dict({key: torch.stack([other[key] for other in others]).mean(0) for key in others[0]})
+    return network, states[-1], {"mean_of": of} if len(of) > 1 else {}
 
 
 def export_runs(args):
@@ -75,7 +79,11 @@ def export_runs(args):
     data.refuse_common(_trained_on([*args.mask, *args.joint, args.coarse]), args.validation)
     mask_file, joint_file = _model_file(args.mask), _model_file(args.joint)
     kept, kept_description = read_model(mask_file) if mask_file else ({}, {})
-    mask, _, mask_mean = _mean_of(args.mask) if not mask_file else (kept["mask"], None, {})
+    if mask_file:
+        mask, mask_mean = kept["mask"], {}
+    else:
+        started, runs = (None, args.mask) if Path(args.mask[0]).is_dir() else (args.mask[0], args.mask[1:])
+        mask, _, mask_mean = _mean_of(runs, started)
     joint, joint_state, joint_mean = _mean_of(args.joint) if not joint_file else (read_model(joint_file)[0]["joint"], None, {})
     coarse = load_coarse(args.coarse) if args.coarse else kept.get("coarse")
     coarse_card = _coarse_card(args.coarse or mask_file) if coarse else {}

@@ -12,8 +12,9 @@ from .networks import CAMERA, share
 
 # The picture's side spans so many standard deviations of the mask: nineteen arms in twenty are seen whole.
 ZOOM = {"spread": 5.0, "least": 0.5, "most": 4.0}
-# The mask network's: never out, and in no farther than the pictures that it is trained on are enlarged.
-MASK_ZOOM = {"spread": 4.5, "least": 1.0, "most": 2.0}
+# The mask network's: never out, in no farther than to the recordings' own pixels, and closer than all of an arm: beyond, the
+# coarse mask is.
+MASK_ZOOM = {"spread": 4.0, "least": 1.0, "most": 2.0}
 # Of the zoom, in an octave; of the direction, in the width of what the camera sees.
 STEPS = (8, 64)
 # What it looks at: the coarse mask, each pixel as heavy as it is probable. A share of it that rose steeply would turn the camera
