@@ -62,7 +62,14 @@ fn signals_end_it_in_time_with_a_whole_line() {
         let folder = folder(&config);
         sources::folder(&folder.path().join("photos"), 5);
         sources::video(&folder.path().join("clip.mkv"), 60);
-        let mut program = watch(folder.path(), None);
+        // Whoever runs the tests may ignore it, as `nohup` does.
+        let watch = command(folder.path());
+        let mut with_signals = std::process::Command::new("env");
+        with_signals.arg("--default-signal=HUP");
+        with_signals.arg(watch.get_program()).args(watch.get_args());
+        with_signals.current_dir(folder.path());
+        with_signals.args(["--adapter", "cpu", "cameras.toml"]);
+        let mut program = Program::start(with_signals);
         program.wait_for_result("video");
         program.wait_for_result("left");
         program.signal(signal);
