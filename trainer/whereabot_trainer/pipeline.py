@@ -67,7 +67,7 @@ def steps(args):
         step("train-mask", f"coarse{suffix}", robots, COARSE * minutes, "--coarse", "--init-from", str(out / f"mask{suffix}"),
              "--crop", "224", "184", "--zoom", "0.5", "1.8", *negatives)
         step("train-mask", f"closer{suffix}", robots, CLOSER * minutes, "--coarse-run", str(out / f"coarse{suffix}"), "--init-from",
-             str(out / f"mask{suffix}"), "--learning-rate", "1e-3", "1e-5", *negatives)
+             str(out / f"mask{suffix}"), "--learning-rate", "1.5e-4", "2e-6", "--no-normalise", *negatives)
 
     def seen_by(suffix):
         return str(out / f"{'closer' if context else 'mask'}{suffix}")
