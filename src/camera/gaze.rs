@@ -14,6 +14,22 @@ impl Gaze {
         zoom: 1.0,
     };
 
+    /// Turned, without a roll, to what the canonical camera sees at `slope`, `x / z` and `y / z`, and zoomed in by `zoom`.
+    pub fn towards([x, y]: [f32; 2], zoom: f32) -> Self {
+        let length = (x * x + y * y + 1.0).sqrt();
+        let [x, y, z] = [x / length, y / length, 1.0 / length];
+        // The shortest turn that brings the axis to the ray.
+        let [bent_x, bent_y] = [x / (1.0 + z), y / (1.0 + z)];
+        Self {
+            rotation: [
+                [1.0 - x * bent_x, -x * bent_y, -x],
+                [-y * bent_x, 1.0 - y * bent_y, -y],
+                [x, y, z],
+            ],
+            zoom,
+        }
+    }
+
     /// What lies in the direction `ray` of the canonical camera's frame, in this one's.
     pub fn turned(&self, ray: [f32; 3]) -> [f32; 3] {
         let along = |axis: [f32; 3]| axis[0] * ray[0] + axis[1] * ray[1] + axis[2] * ray[2];

@@ -41,18 +41,7 @@ pub fn zoom(mask: &Tensor, rule: Overlay, camera: &Intrinsics, zoom: Zoom) -> Ga
     let stepped = |at: f32| (at / step).round_ties_even() * step;
     let x = stepped(mean[0] as f32 + middle[0] - camera.cx as f32) / camera.fx as f32;
     let y = stepped(mean[1] as f32 + middle[1] - camera.cy as f32) / camera.fy as f32;
-    let length = (x * x + y * y + 1.0).sqrt();
-    let [x, y, z] = [x / length, y / length, 1.0 / length];
-    // The shortest turn that brings the axis to the ray.
-    let [bent_x, bent_y] = [x / (1.0 + z), y / (1.0 + z)];
-    Gaze {
-        rotation: [
-            [1.0 - x * bent_x, -x * bent_y, -x],
-            [-y * bent_x, 1.0 - y * bent_y, -y],
-            [x, y, z],
-        ],
-        zoom: nearer,
-    }
+    Gaze::towards([x, y], nearer)
 }
 
 /// The joint network's input as `gaze` sees it: `image` `[3, height, width]` of the canonical `camera`, masked by `mask`

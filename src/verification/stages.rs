@@ -157,24 +157,6 @@ fn plane(
     texture.create_view(&Default::default())
 }
 
-/// Turned by 14 degrees, so that a part of what it sees is beyond the picture.
-const CLOSER: Gaze = Gaze {
-    rotation: [
-        [
-            1.0 - 16.0 / (33.0 * 65.0),
-            -28.0 / (33.0 * 65.0),
-            -4.0 / 33.0,
-        ],
-        [
-            -28.0 / (33.0 * 65.0),
-            1.0 - 49.0 / (33.0 * 65.0),
-            -7.0 / 33.0,
-        ],
-        [4.0 / 33.0, 7.0 / 33.0, 32.0 / 33.0],
-    ],
-    zoom: 1.5,
-};
-
 pub(super) async fn rectify(
     device: &Device,
     layout: Layout,
@@ -187,7 +169,9 @@ pub(super) async fn rectify(
         Orientation::FlipHorizontal,
         Orientation::Rotate180,
     ]);
-    let gaze = case.turn(&[Gaze::CANONICAL, CLOSER]);
+    // Turned by 14 degrees, so that a part of what it sees is beyond the picture.
+    let closer = Gaze::towards([0.125, 0.22], 1.5);
+    let gaze = case.turn(&[Gaze::CANONICAL, closer]);
     let random = &mut case.random;
     let [width, height] = [0; 2].map(|_| random.of(&[31_u32, 64, 101, 150]));
     let camera = Camera {

@@ -17,21 +17,6 @@ fn canonical(width: u32, height: u32) -> Intrinsics {
     }
 }
 
-/// A camera that looks to `(x, y)` at z = 1.
-fn towards(x: f32, y: f32, zoom: f32) -> Gaze {
-    let length = (x * x + y * y + 1.0).sqrt();
-    let [x, y, z] = [x / length, y / length, 1.0 / length];
-    let [bent_x, bent_y] = [x / (1.0 + z), y / (1.0 + z)];
-    Gaze {
-        rotation: [
-            [1.0 - x * bent_x, -x * bent_y, -x],
-            [-y * bent_x, 1.0 - y * bent_y, -y],
-            [x, y, z],
-        ],
-        zoom,
-    }
-}
-
 fn sight(device: &Device, gaze: Gaze, width: usize, height: usize) -> Sight {
     let camera = canonical(width as u32, height as u32);
     let gazes = device.scoped(|| Gazes::new(device, camera, 1)).unwrap();
@@ -147,7 +132,7 @@ proptest! {
         distortion in any_distortion(),
         gaze in prop_oneof![
             Just(Gaze::CANONICAL),
-            (-0.6..0.6_f32, -0.6..0.6_f32, 0.5..4.0_f32).prop_map(|(x, y, zoom)| towards(x, y, zoom)),
+            (-0.6..0.6_f32, -0.6..0.6_f32, 0.5..4.0_f32).prop_map(|(x, y, zoom)| Gaze::towards([x, y], zoom)),
         ],
         seed in any::<u32>(),
     ) {
@@ -185,7 +170,7 @@ fn a_camera_that_looks_closer_sees_the_picture_s_own_pixels() {
         samples: [1, 1],
         ..params
     };
-    let gaze = towards(0.0, 0.0, (1.0 / scale) as f32);
+    let gaze = Gaze::towards([0.0, 0.0], (1.0 / scale) as f32);
     let gazes = device
         .scoped(|| Gazes::new(&device, camera.intrinsics, 2))
         .unwrap();

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use super::program::{Program, command, folder, watch};
+use super::program::{Program, command, folder, watch, watch_by};
 use super::sources;
 
 const PHOTOS: &str = "[[camera]]\nname = \"left\"\nsource = \"photos\"\nweights = \"model.safetensors\"\n\
@@ -63,13 +63,7 @@ fn signals_end_it_in_time_with_a_whole_line() {
         sources::folder(&folder.path().join("photos"), 5);
         sources::video(&folder.path().join("clip.mkv"), 60);
         // Whoever runs the tests may ignore it, as `nohup` does.
-        let watch = command(folder.path());
-        let mut with_signals = std::process::Command::new("env");
-        with_signals.arg("--default-signal=HUP");
-        with_signals.arg(watch.get_program()).args(watch.get_args());
-        with_signals.current_dir(folder.path());
-        with_signals.args(["--adapter", "cpu", "cameras.toml"]);
-        let mut program = Program::start(with_signals);
+        let mut program = watch_by(folder.path(), &["env", "--default-signal=HUP"]);
         program.wait_for_result("video");
         program.wait_for_result("left");
         program.signal(signal);
@@ -84,12 +78,7 @@ fn signals_end_it_in_time_with_a_whole_line() {
 fn a_closed_terminal_does_not_end_what_is_to_outlive_it() {
     let folder = folder(&(PHOTOS.to_owned() + "repeat = true\n"));
     sources::folder(&folder.path().join("photos"), 5);
-    let watch = command(folder.path());
-    let mut outlives = std::process::Command::new("nohup");
-    outlives.arg(watch.get_program()).args(watch.get_args());
-    outlives.current_dir(folder.path());
-    outlives.args(["--adapter", "cpu", "cameras.toml"]);
-    let mut program = Program::start(outlives);
+    let mut program = watch_by(folder.path(), &["nohup"]);
     program.wait_for_result("left");
     program.signal("HUP");
     let seen = program.seen.len();

@@ -60,6 +60,23 @@ pub fn command(folder: &Path) -> Command {
     command
 }
 
+/// In plain Rust, on `cameras.toml`, started by `starter`, which stands in front of a command.
+pub fn watch_by(folder: &Path, starter: &[&str]) -> Program {
+    let watch = command(folder);
+    let mut started = Command::new(starter[0]);
+    started.args(&starter[1..]);
+    started.arg(watch.get_program()).args(watch.get_args());
+    started.current_dir(folder);
+    for (variable, value) in watch.get_envs() {
+        match value {
+            Some(value) => started.env(variable, value),
+            None => started.env_remove(variable),
+        };
+    }
+    started.args(["--adapter", "cpu", "cameras.toml"]);
+    Program::start(started)
+}
+
 /// In plain Rust, on `cameras.toml`, with `bin` before the PATH.
 pub fn watch(folder: &Path, bin: Option<&Path>) -> Program {
     let mut command = command(folder);
