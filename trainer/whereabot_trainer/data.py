@@ -320,6 +320,8 @@ def _uniform(count, low, high, *shape):
 VARIED = 0.35
 # Of what a coarse network learns from: it has to find the robot in any picture, and need not be exact.
 COARSE_VARIED = 0.6
+# The share of the robots with other light in what a mask network's camera sees, as the shipped networks were trained on it.
+CLOSER_RELIT = 0.1
 
 
 def jitter_masks(masks):
@@ -433,10 +435,10 @@ def mixed_views(images, masks, height, width, zoom, share=VARIED):
 
 def closer_views(images, masks, coarse, bf16, share=VARIED):
     """What a mask network behind a `coarse` one learns from: what its camera sees of the pictures, uint8 [N, 2 H, 2 W, 3] with their
-    masks [N, 2 H, 2 W], from their own pixels. Mirrored half of the time; of a share the colours vary, of one the light on the
-    robot, of one the camera."""
+    masks [N, 2 H, 2 W], from their own pixels. Mirrored half of the time; of a share the colours vary, of one the camera, of a smaller one
+    the light on the robot."""
     masks = masks[:, None].float() / 255
-    pictures = relight_some_robots(jitter_some_colours(images, share), masks, share)
+    pictures = relight_some_robots(jitter_some_colours(images, share), masks, min(share, CLOSER_RELIT))
     with torch.no_grad():
         cameras = zoom.look_at(run(coarse, zoom.canonical(pictures), bf16), zoom.MASK_ZOOM, zoom.LOOKED_AT)
     varied = (torch.rand(len(images)) < share)[:, None, None]

@@ -248,7 +248,7 @@ def _curves(run, columns):
 
 def _training(state):
     keep = ("family", "protocol", "seed", "precision", "optimizer", "learning_rate", "momentum", "batch", "normalise",
-            "samples", "crop", "zoom", "negatives", "negative_share", "foreground_share", "w_fg", "w_bg",
+            "samples", "crop", "zoom", "coarse_run", "negatives", "negative_share", "foreground_share", "w_fg", "w_bg",
             "min_coverage", "estimated_masks", "estimated_after", "init_from", "heat_weight")
     return {key: state["card"][key] for key in keep if key in state["card"]} | {
         "minutes": round(state["seconds"] / 60, 1), "iterations": state["iteration"],
